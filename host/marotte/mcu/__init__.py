@@ -1,0 +1,1 @@
+"""Emulated MCUs: the same firmware without a robot, in virtual time or live on a port."""
