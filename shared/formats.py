@@ -1,0 +1,64 @@
+"""Fixed-point formats, codes and sizes that both halves agree on.
+
+`_qN` is an integer in which 1.0 is `1 << N`. The firmware's kernels repeat the numbers they compute with as
+`const`, because viper inlines constants of its own file only; a test holds them against this table.
+
+Unit values: every DOF's value travels as `value_q15`, 0..32768. An absolute DOF's 0..1 is that number divided by
+32768; a relative DOF's -1..1 is shifted and halved first, so that 16384 stands still. The convex sum does not mind,
+being affine, and nothing in the compositor can become negative.
+"""
+
+VALUE_BITS = 15  # values of DOFs and functions, 0..1 inclusive
+WEIGHT_BITS = 28  # weights, weight targets and live channels, 0..4
+ALPHA_BITS = 26  # filter coefficients 1 - exp(-1 / (F * tau))
+TEMPO_BITS = 16  # tempos, rounded when read (SPEC of time: multiples of 1/65536)
+PHASE_BITS = 24  # fraction of a cycle; whole cycles are kept modulo 4096 beside it
+PULSE_BITS = 4  # pulse widths in 1/16 us
+
+VALUE_ONE = 1 << VALUE_BITS
+WEIGHT_ONE = 1 << WEIGHT_BITS
+WEIGHT_MAX = 4 * WEIGHT_ONE
+ALPHA_ONE = 1 << ALPHA_BITS
+TEMPO_ONE = 1 << TEMPO_BITS
+CYCLES = 4096  # all functions repeat after so many periods
+SNAP_Q28 = 1 << 10  # 2^-18: a weight this near to its target is set to it
+FAINT_Q28 = 1 << 20  # 1/256: below it a weight counts as faint
+
+DOFS_MAX = 16
+ACTIONS_MAX = 64
+MAPPINGS_MAX = 512
+LIVES_MAX = 16
+QUEUE_MAX = 256  # stamped targets that wait for their frame
+NOISE_TABLES = 16
+GRADIENTS = 256  # per noise table
+
+FRAME_RATE_MIN_HZ = 10
+FRAME_RATE_MAX_HZ = 60
+TEMPO_MIN_Q16 = 3277  # 0.05
+TEMPO_MAX_Q16 = 8 * TEMPO_ONE
+MASTER_TEMPO_MIN_Q16 = TEMPO_ONE // 4
+MASTER_TEMPO_MAX_Q16 = 4 * TEMPO_ONE
+
+PULSE_MIN_US = 300
+PULSE_MAX_US = 3000
+SERVO_PERIOD_US = 20000
+
+# Function codes of a mapping; `argument` is, in this order: nothing, nothing, the table 0..15, a value_q15, a live channel.
+FUNCTION_RSIN = 0
+FUNCTION_RCOS = 1
+FUNCTION_NOISE = 2
+FUNCTION_CONST = 3
+FUNCTION_LIVE = 4
+
+# Kinds of DOF.
+KIND_ABSOLUTE = 0
+KIND_RELATIVE = 1
+
+FRAME_NOW = -1  # stamp of a target that acts in the next frame, whichever it is
+MASTER = 255  # the `action` of a tempo message that means the master tempo
+NO_PIN = 255  # the `pin` of a DOF that drives nothing
+
+# Taps of a frame, as bits of the taps message.
+TAP_BASE = 1
+TAP_SIGNAL = 2
+TAP_MOTOR = 4

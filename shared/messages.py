@@ -1,0 +1,204 @@
+"""The message dictionary: every message of the link, declared once.
+
+Each entry is `(name, id, fields, items)`. `fields` are the `(name, type)` pairs at fixed places of the payload; `items`
+are the pairs that repeat until the payload ends (empty if nothing repeats). Types are those of `struct`, little-endian:
+B, H, I unsigned of 8, 16, 32 bits, i signed of 32. Names end in format or unit (`_q15`, `_q28`, `_us`); the rest are
+counts, indices and flags. Ids below 128 go to the MCU and are acknowledged, those from 128 up come from it and are
+not. No id is 3: a packet's first byte is its id, and `0D 03` at the start of a packet calls the REPL (see codec).
+
+PROTOCOL counts changes of meaning; the checksum of this dictionary catches changes of layout by itself. Both are
+exchanged by `hello` and `welcome`, whose layout, with that of `ack`, never changes.
+"""
+
+PROTOCOL = 1
+
+HELLO = 0x10
+PING = 0x11
+BEGIN = 0x12
+DOF = 0x13
+OUTPUT = 0x14
+ACTION = 0x15
+MAPPINGS = 0x16
+LIVE = 0x17
+COMMIT = 0x18
+START = 0x20
+STOP = 0x21
+WEIGHT_TARGETS = 0x22
+LIVE_TARGETS = 0x23
+TEMPO = 0x24
+ARM = 0x28
+KILL = 0x29
+TELEMETRY = 0x2A
+STATUS_REQUEST = 0x2B
+WELCOME = 0x80
+ACK = 0x81
+TAPS = 0x82
+WEIGHTS = 0x83
+STATUS = 0x84
+
+MESSAGES = (
+    # --- to the MCU: the session
+    ("hello", HELLO, (("protocol", "H"), ("dictionary", "I")), ()),
+    ("ping", PING, (), ()),
+    # --- to the MCU: a puppet's tables, into the staging area, then all at once
+    (
+        "begin",
+        BEGIN,
+        (
+            ("frame_rate_hz", "B"),
+            ("dofs", "B"),
+            ("actions", "B"),
+            ("mappings", "H"),
+            ("lives", "B"),
+            ("seed", "I"),
+            ("noise_spread_q15", "H"),
+            ("link_timeout_ms", "H"),
+        ),
+        (),
+    ),
+    ("dof", DOF, (("dof", "B"), ("kind", "B"), ("rest_q15", "H"), ("low_q15", "H"), ("high_q15", "H")), ()),
+    ("output", OUTPUT, (("dof", "B"), ("pin", "B"), ("pulse0_q4us", "H"), ("pulse1_q4us", "H")), ()),
+    (
+        "action",
+        ACTION,
+        (
+            ("action", "B"),
+            ("tempo_q16", "I"),
+            ("rise_q26", "I"),
+            ("fall_q26", "I"),
+            ("first_mapping", "H"),
+            ("mappings", "B"),
+        ),
+        (),
+    ),
+    (
+        "mappings",
+        MAPPINGS,
+        (("first_mapping", "H"),),
+        (("dof", "B"), ("function", "B"), ("argument", "H"), ("low_q15", "H"), ("high_q15", "H")),
+    ),
+    ("live", LIVE, (("live", "B"), ("rest_q28", "I"), ("rise_q26", "I"), ("fall_q26", "I")), ()),
+    ("commit", COMMIT, (), ()),
+    # --- to the MCU: the performance
+    ("start", START, (), ()),
+    ("stop", STOP, (), ()),
+    ("weight_targets", WEIGHT_TARGETS, (("frame", "i"),), (("action", "B"), ("target_q28", "I"))),
+    ("live_targets", LIVE_TARGETS, (("frame", "i"),), (("live", "B"), ("target_q28", "I"))),
+    ("tempo", TEMPO, (("frame", "i"),), (("action", "B"), ("tempo_q16", "I"))),
+    ("arm", ARM, (), ()),
+    ("kill", KILL, (), ()),
+    ("telemetry", TELEMETRY, (("taps", "B"), ("taps_every", "H"), ("weights_every", "H")), ()),
+    ("status_request", STATUS_REQUEST, (), ()),
+    # --- from the MCU
+    (
+        "welcome",
+        WELCOME,
+        (
+            ("protocol", "H"),
+            ("dictionary", "I"),
+            ("dofs_max", "B"),
+            ("actions_max", "B"),
+            ("mappings_max", "H"),
+            ("lives_max", "B"),
+            ("queue_max", "H"),
+            ("frame", "i"),
+            ("armed", "B"),
+        ),
+        (),
+    ),
+    ("ack", ACK, (("seq", "B"), ("status", "B"), ("detail", "H")), ()),
+    ("taps", TAPS, (("frame", "i"), ("taps", "B")), (("value_q15", "H"),)),
+    ("weights", WEIGHTS, (("frame", "i"),), (("action", "B"), ("weight_q12", "H"))),
+    (
+        "status",
+        STATUS,
+        (
+            ("frame", "i"),
+            ("armed", "B"),
+            ("silent", "B"),
+            ("late_max_us", "I"),
+            ("late_frames", "I"),
+            ("frame_max_us", "I"),
+            ("packets", "I"),
+            ("damaged", "I"),
+            ("late_targets", "I"),
+            ("heap_free", "I"),
+        ),
+        (),
+    ),
+)
+
+# Status of an acknowledgement; `detail` says which index, count or number was meant.
+OK = 0
+RESEND = 1  # a packet before this one is missing; detail: the sequence number that is expected
+MISMATCH = 2  # hello: protocol or dictionary differ; the welcome that follows tells the MCU's
+UNKNOWN = 3  # no such message; detail: its id
+LENGTH = 4  # the payload has not the length of its message; detail: the length found
+RANGE = 5  # a field is out of its range; detail: which field, counted from 0 (items go on after the fields)
+INCOMPLETE = 6  # commit without all that begin announced; detail: how many parts are missing
+STATE = 7  # not possible now (tables while the motion runs, start without tables, arm without outputs)
+FULL = 8  # the queue of stamped targets is full; detail: its free places
+
+STATUS_TEXT = (
+    "done",
+    "a packet before it is missing",
+    "protocol or message dictionary differ",
+    "unknown message",
+    "wrong length",
+    "a field is out of range",
+    "tables are incomplete",
+    "not possible in this state",
+    "the queue of stamped targets is full",
+)
+
+_SIZES = {"B": 1, "H": 2, "I": 4, "i": 4}
+
+
+def find(message_id):
+    """Return the dictionary's entry for an id, or None."""
+    for message in MESSAGES:
+        if message[1] == message_id:
+            return message
+    return None
+
+
+def size(pairs):
+    """Return the bytes that a tuple of `(name, type)` pairs takes."""
+    return sum(_SIZES[kind] for _, kind in pairs)
+
+
+def offset(message_id, field):
+    """Return the place of a field in its payload, or of an item's field within the item. Raises KeyError."""
+    _, _, fields, items = find(message_id)
+    for pairs in (fields, items):
+        place = 0
+        for name, kind in pairs:
+            if name == field:
+                return place
+            place += _SIZES[kind]
+    raise KeyError(field)
+
+
+def struct_format(pairs):
+    """Return the `struct` format of a tuple of pairs."""
+    return "<" + "".join(kind for _, kind in pairs)
+
+
+def length_fits(message, length):
+    """Return whether a payload may have this length: the fields and a whole number of items."""
+    rest = length - size(message[2])
+    if not message[3]:
+        return rest == 0
+    return rest >= 0 and rest % size(message[3]) == 0
+
+
+def canonical_text():
+    """Return the text whose CRC-32 is the dictionary's checksum: one line a message, in the order declared."""
+    lines = []
+    for name, message_id, fields, items in MESSAGES:
+        parts = [name, str(message_id)]
+        parts.extend(kind + ":" + field for field, kind in fields)
+        parts.append("*")
+        parts.extend(kind + ":" + field for field, kind in items)
+        lines.append(" ".join(parts))
+    return "\n".join(lines)
