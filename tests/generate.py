@@ -1,0 +1,233 @@
+"""Random valid puppets and scores, the same ones for the same seed, and their TOML texts.
+
+Levels: `"core"` has absolute and relative DOFs, `rsin rcos noise1..16 const live`, masks, weights,
+behaviours, live channels and the global tempo; `"full"` adds expressions, tables, blinks, gestures,
+entries, warps, moods, gains and tempo cues of single actions.
+
+All numbers are short decimals, so a text read back by `tomllib` is the dict again.
+"""
+
+import json
+import re
+
+from tests.generate_expressions import random_expression
+
+_MAPPINGS_LIMIT = 512
+_CHANNELS = ("GAZE_YAW", "GAZE_PITCH", "SPEED", "TURN")
+_NOISES = tuple(f"noise{k}" for k in range(1, 17))
+
+
+def random_puppet(rng, level="core", dofs=None, actions=None):
+    """Return a random puppet as `tomllib` would give it.
+
+    Args:
+        rng: a `random.Random`.
+        level: `"core"` or `"full"`.
+        dofs, actions: how many, 1..16 and 1..64; drawn where None, small numbers more often.
+    """
+    dofs = dofs or rng.choice((1, 2, 3, 5, 10, 16, rng.randint(1, 16)))
+    actions = actions or rng.choice((1, 2, 4, 8, 16, 64, rng.randint(1, 64)))
+    puppet = {"name": f"random {level} {rng.randrange(10**6)}", "seed": _random_seed(rng)}
+    if rng.random() < 0.8:
+        puppet["frame_rate"] = rng.choice((10, 25, 30, 50, 60, rng.randint(10, 60)))
+    if rng.random() < 0.4:
+        puppet["noise_spread"] = rng.choice((0, 1, 0.5, _decimal(rng, 0, 1)))
+    puppet["dof"] = {f"DOF_{j}": _random_dof(rng) for j in range(dofs)}
+    declared = rng.sample(_CHANNELS, rng.randint(0, 3))
+    puppet["live"] = {name: _random_live(rng) for name in declared}
+    puppet["function"] = _random_functions(rng) if level == "full" else {}
+    puppet["action"] = {}
+    room = _MAPPINGS_LIMIT
+    for i in range(actions):
+        longest = min(dofs, room - (actions - 1 - i))
+        action = puppet["action"][f"ACTION_{i}"] = _random_action(rng, level, puppet, longest)
+        room -= len(action["map"])
+    names = list(puppet["action"])
+    puppet["behaviour"] = {
+        f"BEHAVIOUR_{i}": {name: random_target(rng) for name in rng.sample(names, rng.randint(1, min(6, actions)))}
+        for i in range(rng.randint(0, 4))
+    }
+    if level == "full":
+        puppet["mood"] = {f"MOOD_{i}": _random_mood(rng) for i in range(rng.randint(0, 3))}
+    return {key: value for key, value in puppet.items() if value != {}}
+
+
+def random_score(rng, puppet, seconds, level="core"):
+    """Return a random score for `puppet`, as `tomllib` would give it, with cues in 0..seconds."""
+    frame_rate = puppet.get("frame_rate", 30)
+    cues = []
+    at_s = 0.0
+    for _ in range(1 + round(seconds * rng.choice((0.3, 1, 3)))):
+        if rng.random() < 0.7:
+            at_s = _random_time(rng, seconds, frame_rate)
+        cues.append({"at": at_s} | _random_cue(rng, puppet, level))
+    if rng.random() < 0.8:
+        cues.sort(key=lambda cue: cue["at"])
+    return {"cue": cues}
+
+
+def random_target(rng):
+    """Return a weight target, 0..4: often 0 or 1, at times faint or large."""
+    return rng.choice((0, 0, 1, 1.0, _decimal(rng, 0, 1), _decimal(rng, 0, 4), 4, _logarithmic(rng, 0.0005, 0.1)))
+
+
+def to_toml(document):
+    """Return the TOML text of a puppet or score; `tomllib.loads` gives an equal dict back."""
+    lines = [f"{key} = {_toml_value(value)}" for key, value in document.items() if not _is_tables(value)]
+    for key, value in document.items():
+        if isinstance(value, dict):
+            for name, table in value.items():
+                lines += ["", f"[{key}.{_toml_key(name)}]"]
+                lines += [f"{_toml_key(inner)} = {_toml_value(item)}" for inner, item in table.items()]
+        elif _is_tables(value):
+            for table in value:
+                lines += ["", f"[[{key}]]"]
+                lines += [f"{inner} = {_toml_value(item)}" for inner, item in table.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _is_tables(value):
+    return isinstance(value, dict) or (isinstance(value, list) and all(isinstance(item, dict) for item in value))
+
+
+def _toml_key(key):
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key)
+
+
+def _toml_value(value):
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_toml_key(key)} = {_toml_value(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml_value, value)) + "]"
+    return json.dumps(value)
+
+
+def _decimal(rng, low, high):
+    return round(rng.uniform(low, high), rng.choice((1, 2, 4, 6)))
+
+
+def _logarithmic(rng, low, high):
+    return min(max(round(low * (high / low) ** rng.random(), 6), low), high)
+
+
+def _random_seed(rng):
+    return rng.choice((0, 1, 1999, 2**31, 2**32 - 1, *(rng.getrandbits(32) for _ in range(5))))
+
+
+def _random_tau(rng):
+    return rng.choice((_logarithmic(rng, 0.03, 10), [_logarithmic(rng, 0.03, 10), _logarithmic(rng, 0.03, 10)]))
+
+
+def _random_dof(rng):
+    if rng.random() < 0.25:
+        return {"kind": "relative"}
+    dof = {"kind": "absolute"} if rng.random() < 0.5 else {}
+    if rng.random() < 0.5:
+        dof["rest"] = rng.choice((0, 1, _decimal(rng, 0, 1)))
+    return dof
+
+
+def _random_live(rng):
+    channel = {}
+    if rng.random() < 0.6:
+        channel["rest"] = _decimal(rng, 0, 1)
+    if rng.random() < 0.6:
+        channel["tau"] = _random_tau(rng)
+    return channel
+
+
+def _random_functions(rng):
+    tables = {
+        f"CURVE_{i}": {"table": [_decimal(rng, 0, 1) for _ in range(rng.choice((2, 3, 7, 64, 256)))]}
+        for i in range(rng.randint(0, 2))
+    }
+    expressions = {
+        f"CUSTOM_{i}": {"expr": random_expression(rng, list(tables), _CHANNELS)} for i in range(rng.randint(0, 4))
+    }
+    return tables | expressions
+
+
+def _random_function(rng, level, functions):
+    """Return a FUNCTION text."""
+    tables = [name for name, function in functions.items() if "table" in function]
+    simple = ("rsin", "rcos", rng.choice(_NOISES), f"const({_decimal(rng, 0, 1)})", f"live({rng.choice(_CHANNELS)})")
+    kinds = ("simple", "simple", "triggered", "function", "expression") if level == "full" else ("simple",)
+    match rng.choice(kinds):
+        case "triggered":
+            threshold = rng.choice((0, 0.5, 0.93, _decimal(rng, 0, 1)))
+            min_gap = rng.choice((0, 1.2, 2, _logarithmic(rng, 0.1, 1000)))
+            name = rng.choice(("blink", "rtrigsin"))
+            return rng.choice((name, f"{name}({threshold}, {min_gap})"))
+        case "function" if functions:
+            return rng.choice(list(functions))
+        case "expression":
+            return random_expression(rng, tables, _CHANNELS)
+    return rng.choice(simple)
+
+
+def _random_action(rng, level, puppet, longest):
+    action = {}
+    if rng.random() < 0.8:
+        action["tempo"] = rng.choice((0.05, 8, 0.5, 1, _logarithmic(rng, 0.05, 8)))
+    if rng.random() < 0.6:
+        action["tau"] = _random_tau(rng)
+    if level == "full":
+        action["entry"] = rng.choice(("sync", "start", "start"))
+        if action["entry"] == "start" and rng.random() < 0.4:
+            action["cycles"] = rng.choice((1, 2, 3, rng.randint(1, 20)))
+        if rng.random() < 0.5:
+            action["warp"] = _logarithmic(rng, 0.05, 10)
+    action["map"] = []
+    for name in rng.sample(list(puppet["dof"]), rng.randint(1, longest)):
+        low_limit = -1 if puppet["dof"][name].get("kind") == "relative" else 0
+        low, high = (rng.choice((low_limit, 1, _decimal(rng, low_limit, 1))) for _ in range(2))
+        action["map"].append([name, low, high, _random_function(rng, level, puppet["function"])])
+    return action
+
+
+def _random_mood(rng):
+    mood = {}
+    if rng.random() < 0.7:
+        mood["gains"] = _random_gains(rng)
+    if rng.random() < 0.7:
+        mood["tempo"] = _logarithmic(rng, 0.25, 4)
+    return mood
+
+
+def _random_gains(rng):
+    return rng.choice(([1] * 7, [_decimal(rng, -2, 2) for _ in range(7)], [_decimal(rng, -4, 4) for _ in range(7)]))
+
+
+def _random_time(rng, seconds, frame_rate):
+    """Return a time that is round, on a frame, just beside one, or anything."""
+    frame = rng.randrange(int(seconds * frame_rate))
+    drawn = rng.choice((frame / frame_rate, rng.uniform(0, seconds)))
+    return rng.choice((int(drawn), round(drawn, 1), round(drawn, 2), round(drawn, 6), round(drawn + 1e-6, 6)))
+
+
+def _random_cue(rng, puppet, level):
+    actions = list(puppet["action"])
+    texts = [text for action in puppet["action"].values() for *_, text in action["map"]]
+    texts += [function.get("expr", "") for function in puppet.get("function", {}).values()]
+    channels = sorted({*puppet.get("live", {}), *re.findall(r"live\((\w+)\)", " ".join(texts))})
+    cue = {}
+    if "behaviour" in puppet and rng.random() < 0.25:
+        cue["behaviour"] = rng.choice(list(puppet["behaviour"]))
+    if rng.random() < 0.7:
+        some = rng.sample(actions, rng.randint(1, min(5, len(actions))))
+        cue["weights"] = {name: random_target(rng) for name in some}
+    if channels and rng.random() < 0.3:
+        cue["live"] = {name: rng.choice((0, 1, _decimal(rng, 0, 1))) for name in rng.sample(channels, 1)}
+    tempo = {}
+    if rng.random() < 0.15:
+        tempo["global"] = rng.choice((0.25, 1, 4, _logarithmic(rng, 0.25, 4)))
+    if level == "full":
+        if rng.random() < 0.2:
+            tempo[rng.choice(actions)] = _logarithmic(rng, 0.05, 8)
+        if "mood" in puppet and rng.random() < 0.15:
+            cue["mood"] = rng.choice(list(puppet["mood"]))
+        if rng.random() < 0.1:
+            cue["gains"] = _random_gains(rng)
+    if tempo:
+        cue["tempo"] = tempo
+    return cue
