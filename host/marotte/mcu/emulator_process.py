@@ -1,0 +1,76 @@
+"""The emulator's process: one JSON object a line to its standard input, one line of answer each (`emulator/protocol.mjs`)."""
+
+from __future__ import annotations
+
+import json
+import select
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from marotte.errors import MarotteError
+
+ANSWER_TIMEOUT_S = 120.0
+"""Longest time for an answer: a second of virtual time takes one or two, on a slow machine with the slow core perhaps thirty."""
+
+STDERR_TAIL_LINES = 20
+
+
+class EmulatorProcess:
+    """Starts `command` and waits until it is ready.
+
+    Raises MarotteError, here or from `ask`, with the end of its standard error if it dies, reports an error or does not answer.
+    """
+
+    def __init__(self, command: Sequence[str | Path]):
+        self._errors = tempfile.TemporaryFile("w+", errors="replace")
+        words = [str(word) for word in command]
+        self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors)
+        self._read()
+
+    @property
+    def alive(self) -> bool:
+        return self._process.poll() is None
+
+    def ask(self, **request) -> dict:
+        """Send one request and return its answer."""
+        try:
+            self._process.stdin.write(json.dumps(request).encode() + b"\n")
+            self._process.stdin.flush()
+        except (OSError, ValueError):
+            raise self._failed("it has ended") from None
+        return self._read()
+
+    def close(self) -> None:
+        """End the process; calling it twice does no harm."""
+        if self.alive:
+            self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout, self._errors):
+            try:
+                stream.close()
+            except OSError:
+                pass  # a request that the dead process did not take
+
+    def _read(self) -> dict:
+        ready, _, _ = select.select([self._process.stdout], [], [], ANSWER_TIMEOUT_S)
+        if not ready:
+            raise self._failed(f"it has not answered for {ANSWER_TIMEOUT_S:.0f} s")
+        line = self._process.stdout.readline()
+        if not line.endswith(b"\n"):
+            raise self._failed("it has ended")
+        answer = json.loads(line)
+        if "error" in answer:
+            raise self._failed(answer["error"])
+        return answer
+
+    def _failed(self, what: str) -> MarotteError:
+        if not self._errors.closed:
+            self._process.kill()
+            self._process.wait()
+            self._errors.seek(0)
+            tail = self._errors.read().splitlines()[-STDERR_TAIL_LINES:]
+        else:
+            tail = []
+        return MarotteError("\n".join([f"the emulated RP2040 failed: {what}", *(f"    {line}" for line in tail)]))
