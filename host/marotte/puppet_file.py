@@ -1,0 +1,295 @@
+"""Reading a puppet file, `[dof.X]` to `[mood.X]`, with every mistake in it reported.
+
+Source: SPEC of files; each value's range is that of the section that defines it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from marotte import functions
+from marotte.functions import Function, FunctionError
+from marotte.positions import KeyPath
+from marotte.puppet import (
+    ABSOLUTE,
+    BANDS,
+    RELATIVE,
+    Action,
+    Character,
+    Curve,
+    Dof,
+    Live,
+    MappingEntry,
+    Mood,
+    Puppet,
+)
+from marotte.tomlfile import Document, FileMistakes, Mistake, Table, check_number, did_you_mean, found, is_identifier
+from shared import formats
+
+TEMPO_RANGE = (0.05, 8)
+MASTER_TEMPO_RANGE = (0.25, 4)
+WEIGHT_RANGE = (0, 4)
+GAIN_RANGE = (-4, 4)
+TAU_RANGE_S = (0.03, 10)
+WARP_RANGE_S = (0.05, 10)
+CYCLES_RANGE = (1, 1000)
+SAMPLES_RANGE = (2, 256)
+SEED_MAX = 2**32 - 1
+MASTER_NAME = "global"
+"""What a score's tempo table calls the master tempo; no action can have this name."""
+
+_MAPPING = 'a mapping ["DOF", LOW, HIGH, "FUNCTION"]'
+
+
+def load_puppet(path: str | Path) -> Puppet:
+    """Return the puppet of a file. Raises FileMistakes, with every mistake in it."""
+    puppet, mistakes = read_puppet(path)
+    if mistakes:
+        raise FileMistakes(mistakes)
+    return puppet
+
+
+def read_puppet(path: str | Path) -> tuple[Puppet, list[Mistake]]:
+    """Return what could be read of a puppet, and every mistake in its file."""
+    document = Document(path)
+    puppet = _Reader(document).puppet() if document.is_parsed else Puppet(Path(path).stem)
+    return puppet, document.in_order()
+
+
+def weights(table: Table, actions: Iterable[str]) -> dict[str, float]:
+    """Return the weight targets of a table whose keys are actions."""
+    known = list(actions)
+    targets = {}
+    for name in table.names():
+        if name not in known:
+            table.mistake(f"unknown action{did_you_mean(name, known)}", name)
+        else:
+            targets[name] = table.number(name, *WEIGHT_RANGE, default=0)
+    return targets
+
+
+def gains(table: Table) -> tuple[float, ...] | None:
+    """Return the seven gains of a table's `gains`, None if it has none."""
+    values = table.numbers("gains", BANDS, *GAIN_RANGE, what="the gains of the seven bands, highest first")
+    if values is None:
+        return None
+    if any(gain != 1 for gain in values):
+        table.not_yet("gains", "gains")
+    return tuple(values)
+
+
+class _Reader:
+    def __init__(self, document: Document) -> None:
+        self.document = document
+        self.root = document.root()
+        self.function_names: Sequence[str] = ()
+        self.dofs: dict[str, Dof] = {}
+        self.lives: dict[str, Live] = {}
+        self.mapping_count = 0
+
+    def puppet(self) -> Puppet:
+        root = self.root
+        name = root.text("name", self.document.path.stem)
+        frame_rate_hz = root.integer("frame_rate", formats.FRAME_RATE_MIN_HZ, formats.FRAME_RATE_MAX_HZ, 30)
+        seed = root.integer("seed", 0, SEED_MAX, Puppet.seed)
+        noise_spread = root.number("noise_spread", 0, 1, 0)
+        when_silent = root.choice("when_silent", ("idle", "rest", "relax"), "idle")
+        if when_silent != "idle":
+            root.not_yet("when_silent", "when_silent")
+        curves = {name: self.curve(name, table) for name, table in root.tables("function")}
+        self.function_names = list(curves)
+        dofs = {name: self.dof(table, name) for name, table in root.tables("dof")}
+        self.dofs = dofs
+        self.lives = {name: self.live(table, name) for name, table in root.tables("live")}
+        actions = {name: self.action(table, name) for name, table in root.tables("action")}
+        behaviours = {name: weights(table, actions) for name, table in root.tables("behaviour")}
+        moods = {name: self.mood(table, name) for name, table in root.tables("mood")}
+        root.finish()
+        self.check_counts(dofs, actions)
+        return Puppet(
+            name,
+            frame_rate_hz,
+            seed,
+            noise_spread,
+            when_silent,
+            dofs,
+            actions,
+            self.lives,
+            curves,
+            behaviours,
+            moods,
+        )
+
+    def dof(self, table: Table, name: str) -> Dof:
+        kind = table.choice("kind", (ABSOLUTE, RELATIVE), ABSOLUTE)
+        relative = kind == RELATIVE
+        low, high = (-1.0, 1.0) if relative else (0.0, 1.0)
+        rest = 0.0 if relative else 0.5
+        if table.has("rest"):
+            if not relative:
+                rest = table.number("rest", 0, 1, rest)
+            elif table.value("rest") != 0:
+                table.mistake(f"found {found(table.value('rest'))}, expected 0: a relative DOF rests at 0", "rest")
+        limits = table.numbers("limits", 2, low, high, what="the least and the greatest value")
+        if limits and limits[0] >= limits[1]:
+            table.mistake(f"found {found(table.value('limits'))}, expected the least value first", "limits")
+        signal = table.boolean("signal", default=None)
+        blinks = self.maps_blink(name)
+        if signal and blinks:
+            table.mistake("found true, expected false: a DOF that blinks has no future to be known", "signal")
+        character = self.character(table) if table.has("character") else None
+        table.finish()
+        is_processed = signal if signal is not None else not (relative or blinks)
+        return Dof(name, kind, rest, (limits[0], limits[1]) if limits else (low, high), is_processed, character)
+
+    def maps_blink(self, dof: str) -> bool:
+        """Return whether any mapping of the DOF, in any action, blinks."""
+        actions = self.root.value("action", {})
+        tables = [table for table in actions.values() if isinstance(table, dict)] if isinstance(actions, dict) else []
+        maps = [table["map"] for table in tables if isinstance(table.get("map"), list)]
+        rows = [row for rows in maps for row in rows if isinstance(row, list) and len(row) == 4 and row[0] == dof]
+        return any(isinstance(row[3], str) and row[3].strip().startswith(tuple(functions.BLINKS)) for row in rows)
+
+    def character(self, table: Table) -> Character:
+        table.not_yet("character", "character")
+        inner = table.table("character")
+        inner.require("f", "a frequency in Hz, 0.2..10")
+        character = Character(
+            inner.number("f", 0.2, 10, 1), inner.number("zeta", 0.1, 3, 1), inner.number("r", -4, 4, 0)
+        )
+        inner.finish()
+        return character
+
+    def curve(self, name: str, table: Table) -> Curve:
+        table.document.not_yet(table.path, "function")
+        if name in functions.PRIMITIVES or name == "t":
+            table.mistake(f'"{name}" is the name of a primitive; expected another name')
+        elif not is_identifier(name):
+            table.mistake("expected a name of letters, digits and _, as it stands in expressions")
+        expression = table.text("expr", "") if table.has("expr") else None
+        if expression is not None:
+            _checked(table, expression)
+        samples = self.samples(table) if table.has("table") else ()
+        if table.has("expr") == table.has("table"):
+            what = "both" if table.has("expr") else "neither"
+            table.mistake(f'has {what}, expected one of "expr" and "table"')
+        table.finish()
+        return Curve(name, expression, samples)
+
+    def samples(self, table: Table) -> tuple[float, ...]:
+        values = table.array("table", "an array of samples in 0..1") or []
+        if values and not SAMPLES_RANGE[0] <= len(values) <= SAMPLES_RANGE[1]:
+            low, high = SAMPLES_RANGE
+            table.mistake(f"found {len(values)} samples, expected {low}..{high}", "table")
+        path = (*table.path, "table")
+        good = [check_number(self.document, (*path, index), value, 0, 1) for index, value in enumerate(values)]
+        return tuple(float(value) for value in values) if all(good) else ()
+
+    def live(self, table: Table, name: str) -> Live:
+        if not is_identifier(name):
+            table.mistake("expected a name of letters, digits and _, as it stands in live(NAME)")
+        rest = table.number("rest", 0, 1, Live.rest)
+        tau_s = _tau(table, Live.tau_s)
+        predict = table.choice("predict", ("hold", "kalman"), Live.predict)
+        if predict == "kalman":
+            table.not_yet("predict", "kalman")
+        table.finish()
+        return Live(name, rest, tau_s, predict)
+
+    def action(self, table: Table, name: str) -> Action:
+        if name == MASTER_NAME:
+            table.mistake(f'"{MASTER_NAME}" names the master tempo in scores; expected another name')
+        tempo = table.number("tempo", *TEMPO_RANGE, default=1)
+        tau_s = _tau(table, Action.tau_s)
+        entry = table.choice("entry", ("sync", "start"), "sync")
+        if entry == "start":
+            table.not_yet("entry", "entry")
+        warp_s = table.number("warp", *WARP_RANGE_S, default=Action.warp_s)
+        if table.has("warp"):
+            table.not_yet("warp", "warp")
+        cycles = table.integer("cycles", *CYCLES_RANGE, default=1) if table.has("cycles") else None
+        if cycles is not None:
+            table.not_yet("cycles", "cycles")
+            if table.value("entry", "sync") == "sync":
+                table.mistake('only an action with entry = "start" has cycles', "cycles")
+        table.require("map", f'map = [ ["DOF", LOW, HIGH, "FUNCTION"], ... ], {_MAPPING} for each DOF it moves')
+        mappings = self.mappings(table)
+        table.finish()
+        return Action(name, mappings, tempo, tau_s, entry, warp_s, cycles)
+
+    def mappings(self, table: Table) -> tuple[MappingEntry, ...]:
+        rows = table.array("map", f"an array of mappings, each {_MAPPING[2:]}")
+        if rows == []:
+            table.mistake("is empty, expected at least one mapping", "map")
+        seen: dict[str, int] = {}
+        entries = []
+        for index, row in enumerate(rows or []):
+            if not isinstance(row, list) or len(row) != 4:
+                table.mistake(f"found {found(row)}, expected {_MAPPING}", "map", index)
+                continue
+            self.mapping_count += 1
+            dof = str(row[0])
+            if dof in seen:
+                table.mistake(f"maps {dof} again, expected it once; see map[{seen[dof]}]", "map", index)
+            seen.setdefault(dof, index)
+            entries.append(self.mapping((*table.path, "map", index), row))
+        return tuple(entry for entry in entries if entry)
+
+    def mapping(self, path: KeyPath, row: list[Any]) -> MappingEntry | None:
+        dof, low, high, text = row
+        known = isinstance(dof, str) and dof in self.dofs
+        if not known:
+            hint = did_you_mean(dof, self.dofs) if isinstance(dof, str) else ""
+            self.document.mistake((*path, 0), f"unknown DOF {found(dof)}{hint}")
+        # A DOF that is unknown may be of either kind: then only what is wrong for both is a mistake.
+        least = 0 if known and not self.dofs[dof].is_relative else -1
+        good = [check_number(self.document, (*path, column), row[column], least, 1) for column in (1, 2)]
+        function = self.function(path, text)
+        return MappingEntry(dof, float(low), float(high), function) if known and all(good) and function else None
+
+    def function(self, path: KeyPath, text: Any) -> Function | None:
+        try:
+            function = functions.parse_function(text, self.function_names)
+        except FunctionError as error:
+            self.document.mistake((*path, 3), f"found {found(text)}: {error}")
+            return None
+        if function.kind == "live":
+            self.lives.setdefault(str(function.arguments[0]), Live(str(function.arguments[0])))
+        self.document.not_yet((*path, 3), function.kind)
+        return function
+
+    def mood(self, table: Table, name: str) -> Mood:
+        tempo = table.number("tempo", *MASTER_TEMPO_RANGE, default=1) if table.has("tempo") else None
+        mood = Mood(name, gains(table), tempo)
+        table.finish()
+        return mood
+
+    def check_counts(self, dofs: dict[str, Dof], actions: dict[str, Action]) -> None:
+        if not dofs:
+            self.root.mistake("has no DOF, expected at least one [dof.NAME]")
+        for what, count, most in (
+            ("DOFs", len(dofs), formats.DOFS_MAX),
+            ("actions", len(actions), formats.ACTIONS_MAX),
+            ("mappings", self.mapping_count, formats.MAPPINGS_MAX),
+            ("live channels", len(self.lives), formats.LIVES_MAX),
+        ):
+            if count > most:
+                self.root.mistake(f"has {count} {what}, expected at most {most}")
+
+
+def _checked(table: Table, expression: str) -> None:
+    try:
+        functions.check_expression(expression)
+    except FunctionError as error:
+        table.mistake(f"found {found(expression)}: {error}", "expr")
+
+
+def _tau(table: Table, default: tuple[float, float]) -> tuple[float, float]:
+    """Return the time constants of rise and fall: `tau` is one number for both or an array of the two."""
+    if isinstance(table.value("tau"), list):
+        both = table.numbers("tau", 2, *TAU_RANGE_S, what="the time constants of rise and fall")
+        return (both[0], both[1]) if both else default
+    tau_s = table.number("tau", *TAU_RANGE_S, default=-1)
+    return default if tau_s < 0 else (tau_s, tau_s)

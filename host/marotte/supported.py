@@ -1,0 +1,21 @@
+"""What the file format defines and this version does not perform yet: the one list of it.
+
+The readers accept and check these things, then ask `Document.not_yet` about each one that a file uses, so that nothing in
+a file is ever ignored silently. Performing a feature means deleting its entry here.
+"""
+
+NOT_YET = {
+    "blink": 'the function "blink"',
+    "rtrigsin": 'the function "rtrigsin"',
+    "expression": "an expression",
+    "function": "a custom function",
+    "entry": 'entry = "start"',
+    "cycles": "a gesture",
+    "warp": "tempo warping",
+    "action_tempo": "a tempo cue for a single action",
+    "gains": "a band gain other than 1",
+    "kalman": 'predict = "kalman"',
+    "character": "character",
+    "when_silent": 'when_silent other than "idle"',
+}
+"""Feature, as the readers call it, and its description at the beginning of "... is not supported by this version"."""

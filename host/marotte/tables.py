@@ -1,0 +1,164 @@
+"""A puppet and a robot in fixed point: the messages that upload them.
+
+    tables = build_tables(load_puppet("puppets/pet.toml"), load_robot("puppets/pet-robot.toml"))
+    for name, fields, items in tables.messages():
+        print(name, fields, items)
+
+Everything is rounded to nearest, halves up; the formats are those of `shared/formats.py`. A positive weight target never
+becomes 0, as that would end the action instead of making it faint.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from marotte.functions import Function
+from marotte.puppet import Action, Dof, MappingEntry, Puppet
+from marotte.wiring import Robot
+from shared import codec, formats, messages
+
+Message: TypeAlias = tuple[str, dict[str, int], list[dict[str, int]]]
+"""Name, fields, and items: see `shared/messages.py`."""
+
+_MESSAGES = {name: (fields, items) for name, _, fields, items in messages.MESSAGES}
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What an MCU needs to know of a puppet and of the robot that it moves."""
+
+    puppet: Puppet
+    robot: Robot
+
+    def messages(self) -> Iterator[Message]:
+        """Yield the upload's messages in their order, `begin` first and `commit` last."""
+        puppet = self.puppet
+        mappings = [entry for action in puppet.actions.values() for entry in action.mappings]
+        yield "begin", self._begin(len(mappings)), []
+        for index, dof in enumerate(puppet.dofs.values()):
+            yield "dof", _dof(index, dof), []
+        for index, name in enumerate(puppet.dofs):
+            if name in self.robot.outputs:
+                yield "output", self._output(index, name), []
+        first = 0
+        for index, action in enumerate(puppet.actions.values()):
+            yield "action", self._action(index, action, first), []
+            first += len(action.mappings)
+        items = [self._mapping(entry) for entry in mappings]
+        step = items_per_message("mappings")
+        for start in range(0, len(items), step):
+            yield "mappings", {"first_mapping": start}, items[start : start + step]
+        for index, live in enumerate(puppet.lives.values()):
+            rise, fall = (alpha_q26(tau_s, puppet.frame_rate_hz) for tau_s in live.tau_s)
+            yield "live", {"live": index, "rest_q28": weight_q28(live.rest), "rise_q26": rise, "fall_q26": fall}, []
+        yield "commit", {}, []
+
+    def _begin(self, mappings: int) -> dict[str, int]:
+        puppet = self.puppet
+        return {
+            "frame_rate_hz": puppet.frame_rate_hz,
+            "dofs": len(puppet.dofs),
+            "actions": len(puppet.actions),
+            "mappings": mappings,
+            "lives": len(puppet.lives),
+            "seed": puppet.seed,
+            "noise_spread_q15": fixed(puppet.noise_spread, formats.VALUE_BITS),
+            "link_timeout_ms": fixed(self.robot.link_timeout_s * 1000, 0),
+        }
+
+    def _output(self, index: int, name: str) -> dict[str, int]:
+        output = self.robot.outputs[name]
+        pulse0, pulse1 = (fixed(end, formats.PULSE_BITS) for end in output.ends_us)
+        return {"dof": index, "pin": output.pin, "pulse0_q4us": pulse0, "pulse1_q4us": pulse1}
+
+    def _action(self, index: int, action: Action, first_mapping: int) -> dict[str, int]:
+        rise, fall = (alpha_q26(tau_s, self.puppet.frame_rate_hz) for tau_s in action.tau_s)
+        return {
+            "action": index,
+            "tempo_q16": tempo_q16(action.tempo),
+            "rise_q26": rise,
+            "fall_q26": fall,
+            "first_mapping": first_mapping,
+            "mappings": len(action.mappings),
+        }
+
+    def _mapping(self, entry: MappingEntry) -> dict[str, int]:
+        code, argument = self._function(entry.function)
+        dof = self.puppet.dofs[entry.dof]
+        return {
+            "dof": list(self.puppet.dofs).index(entry.dof),
+            "function": code,
+            "argument": argument,
+            "low_q15": value_q15(entry.low, dof),
+            "high_q15": value_q15(entry.high, dof),
+        }
+
+    def _function(self, function: Function) -> tuple[int, int]:
+        argument: Any = function.arguments[0] if function.arguments else 0
+        match function.kind:
+            case "rsin":
+                return formats.FUNCTION_RSIN, 0
+            case "rcos":
+                return formats.FUNCTION_RCOS, 0
+            case "noise":
+                return formats.FUNCTION_NOISE, argument - 1
+            case "const":
+                return formats.FUNCTION_CONST, fixed(argument, formats.VALUE_BITS)
+            case "live":
+                return formats.FUNCTION_LIVE, self.puppet.live_index(argument)
+        raise ValueError(f"the function {function} has no code on the wire")
+
+
+def build_tables(puppet: Puppet, robot: Robot | None = None) -> Tables:
+    """Return the tables of a puppet; without a robot it drives no pin."""
+    return Tables(puppet, robot or Robot())
+
+
+def fixed(value: float, bits: int) -> int:
+    """Return `value` with `bits` binary places, rounded to nearest, halves up."""
+    return math.floor(math.ldexp(value, bits) + 0.5)
+
+
+def value_q15(value: float, dof: Dof) -> int:
+    """Return a DOF's value as it travels: 0..1 as it is, -1..1 (relative) shifted and halved."""
+    return fixed((value + 1) / 2 if dof.is_relative else value, formats.VALUE_BITS)
+
+
+def value_of(value: int, dof: Dof) -> float:
+    """Return the DOF's value, 0..1 or -1..1, that a `value_q15` stands for; exact."""
+    share = value / formats.VALUE_ONE
+    return 2 * share - 1 if dof.is_relative else share
+
+
+def weight_q28(weight: float) -> int:
+    """Return a weight, weight target or live value; what is above 0 stays above 0."""
+    return max(fixed(weight, formats.WEIGHT_BITS), 1 if weight > 0 else 0)
+
+
+def tempo_q16(tempo: float) -> int:
+    """Return a tempo, rounded to 1/65536."""
+    return fixed(tempo, formats.TEMPO_BITS)
+
+
+def alpha_q26(tau_s: float, frame_rate_hz: int) -> int:
+    """Return a filter coefficient `1 - exp(-1 / (F * tau))`."""
+    return fixed(-math.expm1(-1 / (frame_rate_hz * tau_s)), formats.ALPHA_BITS)
+
+
+def items_per_message(name: str) -> int:
+    """Return how many items a message of this name has room for."""
+    fields, items = _MESSAGES[name]
+    return (codec.PAYLOAD_MAX - messages.size(fields)) // messages.size(items)
+
+
+def _dof(index: int, dof: Dof) -> dict[str, int]:
+    return {
+        "dof": index,
+        "kind": formats.KIND_RELATIVE if dof.is_relative else formats.KIND_ABSOLUTE,
+        "rest_q15": value_q15(dof.rest, dof),
+        "low_q15": value_q15(dof.limits[0], dof),
+        "high_q15": value_q15(dof.limits[1], dof),
+    }
