@@ -123,6 +123,11 @@ class ReferencePuppet:
         return {name: action.weight.value for name, action in self._actions.items()}
 
     @property
+    def targets(self):
+        """The weight target of every action, by name, in the frame just stepped."""
+        return {name: action.weight.target for name, action in self._actions.items()}
+
+    @property
     def phases(self):
         """The phase of every action, 0..4096 periods, at the frame to come and before its cues."""
         return {
