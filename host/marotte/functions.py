@@ -1,6 +1,6 @@
 """The FUNCTION of a mapping: read from its text in the puppet file.
 
-Source: SPEC of periodic functions. A text is a bare name (`"noise2"`), a call (`"const(0.3)"`, `"live(GAZE_YAW)"`,
+Source: docs/motion.md, functions. A text is a bare name (`"noise2"`), a call (`"const(0.3)"`, `"live(GAZE_YAW)"`,
 `"blink(0.93, 1.2)"`), the name of a `[function.NAME]`, or an expression of primitives. It is parsed with Python's own parser and
 never evaluated.
 """

@@ -1,6 +1,6 @@
 """Reading a puppet file, `[dof.X]` to `[mood.X]`, with every mistake in it reported.
 
-Source: SPEC of files; each value's range is that of the section that defines it.
+Source: docs/puppet-file.md; each value's range is checked where it is read.
 """
 
 from __future__ import annotations

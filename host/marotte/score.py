@@ -5,7 +5,7 @@
     for step in score.steps(puppet):
         print(step.frame, step.weights)
 
-Source: SPEC of files. A cue acts in the first frame whose instant is not before its time; cues of one frame act in the order of
+Source: docs/puppet-file.md. A cue acts in the first frame whose instant is not before its time; cues of one frame act in the order of
 their times, then of the file; within a cue: behaviour, weights, mood, gains, live, tempo.
 """
 
