@@ -5,8 +5,8 @@
     for step in score.steps(puppet):
         print(step.frame, step.weights)
 
-Source: docs/puppet-file.md. A cue acts in the first frame whose instant is not before its time; cues of one frame act in the order of
-their times, then of the file; within a cue: behaviour, weights, mood, gains, live, tempo.
+Source: docs/puppet-file.md. A cue acts in the first frame whose instant is not before its time; cues of one frame act in the
+order of their times, then of the file; within a cue: behaviour, weights, mood, gains, live, tempo.
 """
 
 from __future__ import annotations
@@ -43,6 +43,15 @@ class Cue:
     def frame(self, frame_rate_hz: int) -> int:
         """Return the frame in which the cue acts."""
         return math.ceil(self.at_s * frame_rate_hz)
+
+    def summary(self) -> str:
+        """Return what the cue does in one line, for people."""
+        parts = [self.behaviour or "", f"mood {self.mood}" if self.mood else ""]
+        parts += [f"{name} {value:g}" for name, value in (*self.weights.items(), *self.lives.items())]
+        parts += [f"tempo of {name} {tempo:g}" for name, tempo in self.tempos.items()]
+        parts += [f"tempo {self.master_tempo:g}"] if self.master_tempo is not None else []
+        parts += ["gains " + " ".join(f"{gain:g}" for gain in self.gains)] if self.gains else []
+        return ", ".join(part for part in parts if part)
 
 
 @dataclass(frozen=True)

@@ -61,10 +61,14 @@ class LiveMcu:
         if self.error:
             raise self.error
 
-    def close(self) -> None:
-        """Stop, and close the MCU and the port."""
+    def stop(self) -> None:
+        """Let no more time pass: from now on `mcu` may be looked at from this thread. Calling it twice does no harm."""
         self._stop_sender.close()
         self._thread.join()
+
+    def close(self) -> None:
+        """Stop, and close the MCU and the port."""
+        self.stop()
         self._stop_receiver.close()
         self._endpoint.close()
         self.mcu.close()

@@ -1,0 +1,213 @@
+"""The command `marotte`: its arguments, and nothing that could not be done from Python as well.
+
+Exit status: 0 fine, 1 failure (of a port, an MCU, a file to write), 2 the user's mistake (in the arguments or in a file), 130
+interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+from rich.console import Console
+
+from marotte import check, commands, emulated
+from marotte.errors import MarotteError
+from marotte.tomlfile import FileMistakes
+
+FINE = 0
+FAILURE = 1
+MISTAKE = 2
+INTERRUPTED = 130
+SECONDS_MAX = 1_000_000
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line, by default the program's own, and return its exit status."""
+    options = _parser().parse_args(arguments)
+    command: Callable[[argparse.Namespace], int] = options.command
+    try:
+        return command(options)
+    except FileMistakes as mistakes:
+        return _failed(str(mistakes), MISTAKE)
+    except MarotteError as error:
+        return _failed(f"marotte: {error}", FAILURE)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:  # whoever read our output has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILURE
+
+
+def _failed(text: str, status: int) -> int:
+    print(text, file=sys.stderr)
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="marotte", description="Puppets that live on their own microcontroller, directed over a serial link."
+    )
+    commands_ = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for add in (_add_check, _add_render, _add_run, _add_ports, _add_mcu):
+        add(commands_)
+    return parser
+
+
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    """Keeps the lines of an example."""
+
+
+def _command(
+    commands_: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    does: str,
+    run: Callable[[argparse.Namespace], int],
+    *examples: str,
+) -> argparse.ArgumentParser:
+    epilog = "\n".join([f"example{'s' if len(examples) > 1 else ''}:", *(f"  {example}" for example in examples)])
+    parser = commands_.add_parser(
+        name, help=does, description=does[:1].upper() + does[1:] + ".", epilog=epilog, formatter_class=_Formatter
+    )
+    parser.set_defaults(command=run)
+    return parser
+
+
+def _add_check(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands_,
+        "check",
+        "check puppet, score and robot files and report every mistake in them",
+        _check,
+        "marotte check puppets/pet.toml",
+        "marotte check puppets/pet.toml puppets/pet-score.toml puppets/pet-robot.toml",
+    )
+    parser.add_argument(
+        "files",
+        nargs="+",
+        metavar="FILE",
+        help="a file of any of the three kinds; a score or robot is checked against the puppet given with it",
+    )
+
+
+def _add_render(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands_,
+        "render",
+        "play a score on an emulated MCU in virtual time and write every frame to a CSV file",
+        _render,
+        "marotte render puppets/pet.toml --score puppets/pet-score.toml --seconds 20 --mcu unix --out pet.csv",
+    )
+    _add_files(parser)
+    parser.add_argument("--seconds", type=_seconds, required=True, help="length of the rendering")
+    parser.add_argument("--mcu", choices=emulated.KINDS, required=True, help="the emulated MCU to render on")
+    parser.add_argument("--out", required=True, metavar="FILE.csv", help="the file to write")
+
+
+def _add_run(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands_,
+        "run",
+        "play a score live, on a robot or on an emulated MCU, and show what happens",
+        _run,
+        "marotte run puppets/pet.toml --score puppets/pet-score.toml --mcu rp2040",
+        "marotte run puppets/pet.toml --score puppets/pet-score.toml --port /dev/ttyACM0 \\",
+        "    --robot puppets/pet-robot.toml --arm",
+    )
+    _add_files(parser)
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--port", help="the robot's serial port, or a URL that pyserial opens (see `marotte ports`)")
+    where.add_argument("--mcu", choices=emulated.KINDS, help="an emulated MCU, run in real time")
+    parser.add_argument("--arm", action="store_true", help="let the robot's outputs give pulses: it moves")
+    parser.add_argument("--seconds", type=_seconds, help="stop after so long (default: 2 s after the last cue)")
+    parser.add_argument("--no-view", action="store_true", help="print a line a cue instead of the moving picture")
+
+
+def _add_ports(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    _command(commands_, "ports", "list the serial ports of this machine", _ports, "marotte ports")
+
+
+def _add_mcu(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands_,
+        "mcu",
+        "run an emulated MCU in real time, for mpremote, `marotte run --port` or any serial program",
+        _mcu,
+        "marotte mcu rp2040",
+        "marotte mcu unix --tcp 4000        then: marotte run ... --port socket://127.0.0.1:4000",
+    )
+    parser.add_argument("kind", choices=emulated.KINDS, help="the emulated MCU")
+    parser.add_argument("--tcp", type=_tcp_port, metavar="PORT", help="a TCP port (default: a pseudo-terminal)")
+    rp2040 = parser.add_argument_group("rp2040 only")
+    rp2040.add_argument("--image", type=Path, metavar="FILE.uf2", help="another image than our own")
+    rp2040.add_argument("--link", choices=("usb", "uart"), help="the line that is served (default: usb)")
+    rp2040.add_argument("--flash", type=Path, metavar="FILE", help="a file that keeps the flash from run to run")
+
+
+def _add_files(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("puppet", metavar="PUPPET", help="the puppet file")
+    parser.add_argument("--score", required=True, help="the score file")
+    parser.add_argument("--robot", help="the robot file: wiring and calibration")
+
+
+def _seconds(text: str) -> Fraction:
+    """Return a positive number of seconds, exactly as its decimal text says."""
+    try:
+        seconds = Fraction(text) if len(text) <= 30 and "e" not in text.lower() else None
+    except (ValueError, ZeroDivisionError):
+        seconds = None
+    if seconds is None or not 0 < seconds <= SECONDS_MAX:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number of seconds above 0")
+    return seconds
+
+
+def _tcp_port(text: str) -> int:
+    if not text.isdecimal() or not 0 <= int(text) <= 65535:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a TCP port, 0..65535")
+    return int(text)
+
+
+def _check(options: argparse.Namespace) -> int:
+    report = check.check_files(options.files)
+    for line in report.fine:
+        print(line)
+    for mistake in report.mistakes:
+        print(mistake, file=sys.stderr)
+    if report.mistakes:
+        count = len(report.mistakes)
+        return _failed(f"{count} mistake{'s' if count > 1 else ''}", MISTAKE)
+    return FINE
+
+
+def _render(options: argparse.Namespace) -> int:
+    files = commands.load(options.puppet, options.score, options.robot)
+    commands.render_to_csv(files, options.seconds, options.mcu, Path(options.out), Console(stderr=True))
+    return FINE
+
+
+def _run(options: argparse.Namespace) -> int:
+    if options.arm and not options.robot:
+        return _failed("marotte: --arm needs --robot FILE, which says where the outputs are", MISTAKE)
+    files = commands.load(options.puppet, options.score, options.robot)
+    console = Console()
+    if options.port:
+        interrupted = commands.run_on_port(files, options.port, options.arm, options.seconds, options.no_view, console)
+    else:
+        interrupted = commands.run_on_mcu(files, options.mcu, options.arm, options.seconds, options.no_view, console)
+    return INTERRUPTED if interrupted else FINE
+
+
+def _ports(options: argparse.Namespace) -> int:
+    commands.list_ports()
+    return FINE
+
+
+def _mcu(options: argparse.Namespace) -> int:
+    if options.kind != "rp2040" and (options.image or options.link or options.flash):
+        return _failed("marotte: --image, --link and --flash are for the rp2040 only", MISTAKE)
+    commands.serve_mcu(options.kind, options.tcp, options.image, options.link or "usb", options.flash)
+    return FINE

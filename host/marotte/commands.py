@@ -1,0 +1,168 @@
+"""What the commands of the command line do, given their arguments."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from marotte import ports, wiring
+from marotte.emulated import open_mcu
+from marotte.errors import MarotteError
+from marotte.ports import SerialCarrier
+from marotte.pulses import PulseSummary, measure
+from marotte.puppet import Puppet
+from marotte.puppet_file import read_puppet
+from marotte.score import Score, read_score
+from marotte.tomlfile import FileMistakes
+from marotte.view import View
+from marotte.wiring import Robot
+
+
+@dataclass(frozen=True)
+class Files:
+    """A puppet, what it plays, and on which robot."""
+
+    puppet: Puppet
+    score: Score
+    robot: Robot | None
+
+
+def load(puppet_path: str, score_path: str, robot_path: str | None) -> Files:
+    """Return what the files hold. Raises FileMistakes, with the mistakes of all of them."""
+    puppet, mistakes = read_puppet(puppet_path)
+    if not puppet.dofs:
+        raise FileMistakes(mistakes)  # nothing that the others could be checked against
+    score, score_mistakes = read_score(score_path, puppet)
+    robot, robot_mistakes = wiring.read_robot(robot_path, puppet) if robot_path else (None, [])
+    mistakes = [*mistakes, *score_mistakes, *robot_mistakes]
+    if mistakes:
+        raise FileMistakes(mistakes)
+    return Files(puppet, score, robot)
+
+
+def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console: Console) -> None:
+    """Render into a file, with a progress bar, and tell about the run. Raises MarotteError."""
+    from marotte.render import frame_count, render
+
+    _require_writable(out)
+    bar = Progress(
+        TextColumn("rendering on {task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    with bar:
+        task = bar.add_task(mcu, total=frame_count(seconds, files.puppet.frame_rate_hz))
+        rendering = render(
+            files.puppet,
+            files.score,
+            seconds,
+            mcu,
+            files.robot,
+            progress=lambda done, of: bar.update(task, completed=done, total=of),
+        )
+    rendering.write_csv(out)
+    print(f"{out}: {len(rendering.frames)} frames, {len(files.puppet.dofs)} DOFs")
+    for key, value in rendering.report.items():
+        print(f"  {key}: {value:,}" if isinstance(value, int) else f"  {key}: {value}")
+
+
+def run_on_port(files: Files, port: str, arm: bool, seconds: Fraction | None, no_view: bool, console: Console) -> bool:
+    """Play live on a port; return whether the user ended it. Raises MarotteError."""
+    carrier = SerialCarrier(port)
+    try:
+        return _perform(files, carrier, port, arm, seconds, no_view, console)
+    finally:
+        carrier.close()
+
+
+def run_on_mcu(files: Files, mcu: str, arm: bool, seconds: Fraction | None, no_view: bool, console: Console) -> bool:
+    """Play live on an emulated MCU and show the pulses of its pins; return whether the user ended it. Raises MarotteError."""
+    from marotte.mcu.serve import serve
+
+    with open_mcu(mcu) as virtual, serve(virtual) as live:
+        carrier = SerialCarrier(live.url)
+        try:
+            interrupted = _perform(files, carrier, f"emulated {mcu}", arm, seconds, no_view, console)
+        finally:
+            carrier.close()
+        if files.robot and arm:
+            live.stop()
+            _print_pulses(measure(virtual, files.robot), console)
+    return interrupted
+
+
+def serve_mcu(kind: str, tcp: int | None, image: Path | None, link: str, flash: Path | None) -> None:
+    """Serve an emulated MCU until it fails or the user interrupts. Raises MarotteError."""
+    from marotte.mcu.serve import serve, serve_rp2040
+
+    live_mcu: contextlib.AbstractContextManager
+    with contextlib.ExitStack() as stack:
+        if kind == "rp2040":
+            live_mcu = serve_rp2040(tcp, image=image, link=link, flash=flash)
+        else:
+            live_mcu = serve(stack.enter_context(open_mcu(kind)), tcp)
+        live = stack.enter_context(live_mcu)
+        print(f"the emulated {kind} is at {live.url}   (Ctrl-C ends it)", flush=True)
+        live.wait()
+
+
+def list_ports() -> None:
+    """Print the serial ports of this machine."""
+    found = ports.available()
+    for port in found:
+        print(port)
+    if not found:
+        print("no serial port found (is the robot plugged in?)")
+
+
+def _perform(
+    files: Files,
+    carrier: SerialCarrier,
+    where: str,
+    arm: bool,
+    seconds: Fraction | None,
+    no_view: bool,
+    console: Console,
+) -> bool:
+    from marotte.run import default_seconds, perform
+
+    length_s = float(default_seconds(files.score) if seconds is None else seconds)
+    with View(files.puppet, files.robot if arm else None, where, length_s, console, quiet=no_view) as view:
+        performance = perform(files.puppet, files.score, carrier, view, robot=files.robot, arm=arm, seconds=seconds)
+    status = performance.status
+    how = "stopped by hand" if performance.is_interrupted else "played"
+    late = f", {status['late_frames']} late, at most {status['late_max_us']} us" if status else ""
+    console.print(f"{how}: {performance.frames} frames{late}; outputs are off", highlight=False)
+    return performance.is_interrupted
+
+
+def _print_pulses(summaries: list[PulseSummary], console: Console) -> None:
+    table = Table(title="Pulses measured at the pins", title_justify="left", box=None, padding=(0, 2, 0, 0))
+    for heading in ("DOF", "pin", "pulses", "last", "shortest", "longest"):
+        table.add_column(heading, justify="left" if heading in ("DOF", "pin") else "right", header_style="dim")
+    for pin in summaries:
+        widths = (f"{width:.1f} us" for width in (pin.last_us, pin.least_us, pin.greatest_us))
+        table.add_row(pin.dof, f"GP{pin.pin}", str(pin.count), *widths)
+    if summaries:
+        console.print(table)
+    else:
+        console.print("no pin has given a pulse", highlight=False)
+
+
+def _require_writable(out: Path) -> None:
+    """Raise MarotteError if a file cannot be written, before the work is done for it."""
+    try:
+        with out.open("a"):
+            pass
+    except OSError as error:
+        raise MarotteError(f"{out}: cannot be written: {(error.strerror or str(error)).lower()}") from error
