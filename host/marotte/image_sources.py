@@ -36,7 +36,7 @@ ANSWER_TIMEOUT_S = 5.0
 """How long the release's server may take to answer; machines without the Internet go on to Debian's mirror after it."""
 
 _UNUSED_LIBRARIES = ("alif*", "arduino-lib", "asf4", "fsp", "nrfx", "nxp_driver", "stm32lib")
-_PICO_LIBRARIES = ("pico-sdk/pico_sdk_init.cmake", "tinyusb/src/tusb.h", "mbedtls/include/mbedtls/version.h")
+PICO_LIBRARIES = ("pico-sdk/pico_sdk_init.cmake", "tinyusb/src/tusb.h", "mbedtls/include/mbedtls/version.h")
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Sources:
 
     def require_pico_libraries(self) -> None:
         """Raise MarotteError if a library that the RP2040 image needs is missing from the tree."""
-        for name in _PICO_LIBRARIES:
+        for name in PICO_LIBRARIES:
             folder, file = name.split("/", 1)
             path = self.pico_sdk / file if folder == "pico-sdk" else self.micropython / "lib" / name
             if not path.is_file():

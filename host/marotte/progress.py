@@ -56,10 +56,13 @@ def doing(what: str, about_s: float | None = None) -> Iterator[None]:
     try:
         yield
         outcome = "done"
+    except Exception:
+        outcome = "failed"
+        raise
     finally:
         finished.set()
         ticker.join()
         _steps.pop()
         if on_terminal:
             sys.stderr.write("\r\x1b[K")
-        say(f"{what}: {outcome} in {time.monotonic() - start_s:.1f} s")
+        say(f"{what}: {outcome} after {time.monotonic() - start_s:.1f} s")

@@ -18,3 +18,8 @@ ifeq ($(MICROPY_FORCE_32BIT),1)
 # Floats are rounded as the RP2040 rounds them, not in the 80-bit registers of the 387.
 CFLAGS_EXTRA += -msse2 -mfpmath=sse
 endif
+
+ifeq ($(shell uname -s),Linux)
+# The id would be that of the debug information, which names the folder of the build.
+LDFLAGS_EXTRA += -Wl,--build-id=none
+endif
