@@ -4,6 +4,7 @@ import struct
 import subprocess
 
 import pytest
+
 from marotte.images import rp2040_image, unix_binary
 
 UF2_MAGICS = (0x0A324655, 0x9E5D5157, 0x0AB16F30)
