@@ -7,6 +7,9 @@ const TIMER = 0x40054;
 const WATCHDOG = 0x40058;
 const ROSC = 0x40060;
 const VREG_AND_CHIP_RESET = 0x40064;
+const SIO_FIFO_ST = 0x50;
+const SIO_FIFO_RD = 0x58;
+const FIFO_READY_FOR_WRITING = 2;
 const ROSC_STATUS_STABLE = [0x18, 0x81001000];
 const ROSC_RANDOMBIT = [0x1c, 1];
 
@@ -31,6 +34,7 @@ export function correct(mcu) {
   mcu.peripherals[ROSC] = new RegisterFile(mcu, 'ROSC', ROSC_STATUS_STABLE, ROSC_RANDOMBIT);
   mcu.peripherals[VREG_AND_CHIP_RESET] = new RegisterFile(mcu, 'VREG_AND_CHIP_RESET');
   alarmOnTheMicrosecond(mcu, mcu.peripherals[TIMER]);
+  emptyCoreFifo(mcu.sio);
 }
 
 /** An alarm goes off when the counter becomes its value; rp2040js rounds the time left down, up to 1 us too early. */
@@ -46,6 +50,16 @@ function alarmOnTheMicrosecond(mcu, timer) {
   };
 }
 
+/** The mailbox between the cores, which rp2040js does not have: empty, and nobody at the other end. */
+function emptyCoreFifo(sio) {
+  const read = sio.readUint32;
+  sio.readUint32 = (offset) => {
+    if (offset === SIO_FIFO_ST) return FIFO_READY_FOR_WRITING;
+    if (offset === SIO_FIFO_RD) return 0;
+    return read.call(sio, offset);
+  };
+}
+
 /** What survives a reset by the watchdog: its scratch registers, and the reason for the reset. */
 export function keepWatchdogState(from, to) {
   const [before, after] = [from.peripherals[WATCHDOG], to.peripherals[WATCHDOG]];
@@ -54,7 +68,11 @@ export function keepWatchdogState(from, to) {
 }
 
 export function onWatchdogReset(mcu, callback) {
-  mcu.peripherals[WATCHDOG].onWatchdogTrigger = callback;
+  const watchdog = mcu.peripherals[WATCHDOG];
+  watchdog.onWatchdogTrigger = () => {
+    watchdog.timer.enable = false; // it would go off again in the same instant, for ever
+    callback();
+  };
 }
 
 /** rp2040js complains of much that is harmless; only its errors are worth seeing, and the first few of them. */

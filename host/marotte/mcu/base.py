@@ -74,5 +74,5 @@ class VirtualMcu(ABC):
     def __enter__(self):
         return self
 
-    def __exit__(self, *exc_info) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self.close()

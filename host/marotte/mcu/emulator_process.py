@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import select
 import subprocess
@@ -24,20 +25,26 @@ class EmulatorProcess:
     """
 
     def __init__(self, command: Sequence[str | Path]):
-        self._errors = tempfile.TemporaryFile("w+", errors="replace")
+        self._errors = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115
         words = [str(word) for word in command]
         self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors)
+        assert self._process.stdin and self._process.stdout
+        self._requests, self._answers = self._process.stdin, self._process.stdout
         self._read()
 
     @property
     def alive(self) -> bool:
         return self._process.poll() is None
 
-    def ask(self, **request) -> dict:
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def ask(self, **request: object) -> dict:
         """Send one request and return its answer."""
         try:
-            self._process.stdin.write(json.dumps(request).encode() + b"\n")
-            self._process.stdin.flush()
+            self._requests.write(json.dumps(request).encode() + b"\n")
+            self._requests.flush()
         except (OSError, ValueError):
             raise self._failed("it has ended") from None
         return self._read()
@@ -47,17 +54,16 @@ class EmulatorProcess:
         if self.alive:
             self._process.kill()
         self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout, self._errors):
-            try:
-                stream.close()
-            except OSError:
-                pass  # a request that the dead process did not take
+        self._answers.close()
+        self._errors.close()
+        with contextlib.suppress(OSError):  # of a request that the dead process did not take
+            self._requests.close()
 
     def _read(self) -> dict:
-        ready, _, _ = select.select([self._process.stdout], [], [], ANSWER_TIMEOUT_S)
+        ready, _, _ = select.select([self._answers], [], [], ANSWER_TIMEOUT_S)
         if not ready:
             raise self._failed(f"it has not answered for {ANSWER_TIMEOUT_S:.0f} s")
-        line = self._process.stdout.readline()
+        line = self._answers.readline()
         if not line.endswith(b"\n"):
             raise self._failed("it has ended")
         answer = json.loads(line)
@@ -66,11 +72,10 @@ class EmulatorProcess:
         return answer
 
     def _failed(self, what: str) -> MarotteError:
+        tail = []
         if not self._errors.closed:
             self._process.kill()
             self._process.wait()
             self._errors.seek(0)
             tail = self._errors.read().splitlines()[-STDERR_TAIL_LINES:]
-        else:
-            tail = []
         return MarotteError("\n".join([f"the emulated RP2040 failed: {what}", *(f"    {line}" for line in tail)]))

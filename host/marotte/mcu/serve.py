@@ -1,8 +1,8 @@
 """An emulated MCU in real time on a port, for mpremote, `marotte run`, or any serial program.
 
-    with serve_rp2040(tcp=4000) as live:
-        print(live.url)         # socket://127.0.0.1:4000
-        live.wait()             # until it fails or the user interrupts
+with serve_rp2040(tcp=4000) as live:
+    print(live.url)         # socket://127.0.0.1:4000
+    live.wait()             # until it fails or the user interrupts
 """
 
 from __future__ import annotations
