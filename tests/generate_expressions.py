@@ -104,9 +104,7 @@ def _scaled(rng, operand, *_):
 def _divided(rng, operand, *_):
     divisor = rng.choice((2, 3, 0.5, round(rng.uniform(0.3, 5), 3)))
     text = f"{operand.within(_PRODUCT)}/{divisor}"
-    return _Expression(
-        text, operand.low / divisor, operand.high / divisor, operand.amplification / divisor, _PRODUCT
-    )
+    return _Expression(text, operand.low / divisor, operand.high / divisor, operand.amplification / divisor, _PRODUCT)
 
 
 def _extreme(rng, left, right, _):

@@ -130,10 +130,7 @@ class ReferencePuppet:
     @property
     def phases(self):
         """The phase of every action, 0..4096 periods, at the frame to come and before its cues."""
-        return {
-            name: action.phase(self._master) % _PHASES_REPEAT_PERIODS
-            for name, action in self._actions.items()
-        }
+        return {name: action.phase(self._master) % _PHASES_REPEAT_PERIODS for name, action in self._actions.items()}
 
     @property
     def closest(self):
@@ -260,9 +257,7 @@ class ReferencePuppet:
         """Whether, until a cue comes, every weight stays and every offset dies out by its own law."""
         smoothed = (*(hold.weight for hold in self._holds), *self._live.values())
         return all(value.at_rest for value in smoothed) and all(
-            action.weight.at_rest
-            and not action.gesture_runs
-            and action.offset_shrinks_freely(self._global_tempo_q16)
+            action.weight.at_rest and not action.gesture_runs and action.offset_shrinks_freely(self._global_tempo_q16)
             for action in self._actions.values()
         )
 

@@ -160,7 +160,15 @@ def test_triggered_streams_differ_by_mapping_and_go_on_when_the_action_enters():
 
 @pytest.mark.parametrize(
     ("at_s", "frame_rate", "frame"),
-    [(0, 30, 0), (1.1, 100, 110), (0.1, 30, 3), (0.7, 10, 7), (0.333333, 30, 10), (0.333334, 30, 11), (86400.0, 30, 2592000)],
+    [
+        (0, 30, 0),
+        (1.1, 100, 110),
+        (0.1, 30, 3),
+        (0.7, 10, 7),
+        (0.333333, 30, 10),
+        (0.333334, 30, 11),
+        (86400.0, 30, 2592000),
+    ],
 )
 def test_cue_acts_in_the_first_frame_not_before_its_decimal_time(at_s, frame_rate, frame):
     assert frame_of_cue(at_s, frame_rate) == frame
