@@ -52,12 +52,12 @@ def doing(what: str, about_s: float | None = None) -> Iterator[None]:
     _steps.append(what)
     ticker = threading.Thread(target=tick, daemon=True)
     ticker.start()
-    outcome = "stopped"
+    outcome = "stopped after"
     try:
         yield
-        outcome = "done"
+        outcome = "done in"
     except Exception:
-        outcome = "failed"
+        outcome = "failed after"
         raise
     finally:
         finished.set()
@@ -65,4 +65,4 @@ def doing(what: str, about_s: float | None = None) -> Iterator[None]:
         _steps.pop()
         if on_terminal:
             sys.stderr.write("\r\x1b[K")
-        say(f"{what}: {outcome} after {time.monotonic() - start_s:.1f} s")
+        say(f"{what}: {outcome} {time.monotonic() - start_s:.1f} s")

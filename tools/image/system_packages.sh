@@ -36,7 +36,7 @@ if [ "${1:-}" != --check ] && command -v apt-get > /dev/null; then
     as_root=()
     [ "$(id -u)" = 0 ] || as_root=(sudo -n)
     if [ ${#as_root[@]} = 0 ] || sudo -n true 2> /dev/null; then
-        echo "marotte: installing ${missing[*]} (the first time: about 330 MB, a minute or two)" >&2
+        echo "marotte: installing ${missing[*]} (a minute or two)" >&2
         export DEBIAN_FRONTEND=noninteractive
         log=$(mktemp)
         # The lists may be missing altogether, or name versions that are gone.
