@@ -52,6 +52,7 @@ MESSAGES = (
             ("lives", "B"),
             ("seed", "I"),
             ("noise_spread_q15", "H"),
+            ("hold_q26", "I"),
             ("link_timeout_ms", "H"),
         ),
         (),

@@ -23,6 +23,9 @@ from shared import codec, formats, messages
 Message: TypeAlias = tuple[str, dict[str, int], list[dict[str, int]]]
 """Name, fields, and items: see `shared/messages.py`."""
 
+HOLD_TAU_S = 0.25
+"""How HOLD, which takes over what no action moves, comes and goes."""
+
 _MESSAGES = {name: (fields, items) for name, _, fields, items in messages.MESSAGES}
 
 
@@ -66,6 +69,7 @@ class Tables:
             "lives": len(puppet.lives),
             "seed": puppet.seed,
             "noise_spread_q15": fixed(puppet.noise_spread, formats.VALUE_BITS),
+            "hold_q26": alpha_q26(HOLD_TAU_S, puppet.frame_rate_hz),
             "link_timeout_ms": fixed(self.robot.link_timeout_s * 1000, 0),
         }
 

@@ -1,0 +1,176 @@
+"""Stamped targets: what the host sends waits here for the frame in which it acts.
+
+A target is a weight target, a live channel's target or a tempo. Targets of one frame act in the order of their arrival. All storage
+is preallocated; what does not fit is refused whole, and the host sends it again.
+"""
+
+from array import array
+
+import micropython
+from micropython import const
+
+from shared import messages
+from shared.formats import (
+    MASTER,
+    MASTER_TEMPO_MAX_Q16,
+    MASTER_TEMPO_MIN_Q16,
+    QUEUE_MAX,
+    WEIGHT_MAX,
+    WEIGHT_ONE,
+)
+
+WEIGHT = const(0)
+LIVE = const(1)
+TEMPO = const(2)
+_NOW = const(128)  # added to the kind of a target that acts in the next frame and cannot be late
+
+
+@micropython.viper
+def _put(
+    body: ptr8,
+    start: int,
+    items: int,
+    kind: int,
+    first_index: int,
+    indices: int,
+    least: int,
+    most: int,
+    queue_frame: ptr32,
+    queue_kind: ptr8,
+    queue_index: ptr8,
+    queue_value: ptr32,
+    count: int,
+) -> int:
+    """Append `items` targets of 5 bytes (index, value as 32 bits) behind a frame stamp; return -1, or the place of a bad one.
+
+    Nothing is stored unless all indices lie in first_index .. first_index + indices - 1 and all values in least..most. The payload begins
+    at `start` with the stamp, -1 for now. Values are below 2^31 once the top byte has been looked at. A bad stamp is place 0, then every
+    item has two places, as in the acknowledgement's detail.
+    """
+    if int(body[start + 3]) & 128:
+        if (int(body[start]) & int(body[start + 1]) & int(body[start + 2]) & int(body[start + 3])) != 255:
+            return 0
+        frame = 0
+        kind = kind | 128
+    else:
+        frame = (
+            int(body[start])
+            | (int(body[start + 1]) << 8)
+            | (int(body[start + 2]) << 16)
+            | (int(body[start + 3]) << 24)
+        )
+    n = 0
+    while n < items:
+        at = start + 4 + 5 * n
+        index = int(body[at])
+        if index < first_index or index >= first_index + indices:
+            return 1 + 2 * n
+        if body[at + 4] >= 128:
+            return 2 + 2 * n
+        value = (
+            int(body[at + 1])
+            | (int(body[at + 2]) << 8)
+            | (int(body[at + 3]) << 16)
+            | (int(body[at + 4]) << 24)
+        )
+        if value < least or value > most:
+            return 2 + 2 * n
+        # Stored beyond `count`, so it does not exist until the caller counts it.
+        queue_frame[count + n] = frame
+        queue_kind[count + n] = kind
+        queue_index[count + n] = index
+        queue_value[count + n] = value
+        n += 1
+    return -1
+
+
+@micropython.viper
+def _apply(
+    frame: int,
+    count: int,
+    queue_frame: ptr32,
+    queue_kind: ptr8,
+    queue_index: ptr8,
+    queue_value: ptr32,
+    weight_target_q28: ptr32,
+    live_target_q28: ptr32,
+    tempo_q16: ptr32,
+    late: ptr32,
+) -> int:
+    """Let all targets stamped `frame` or earlier act, close the gaps; return how many wait. `late[0]` counts the late ones."""
+    kept = 0
+    n = 0
+    while n < count:
+        if queue_frame[n] <= frame:
+            kind = int(queue_kind[n])
+            if kind < 128:
+                if queue_frame[n] < frame:
+                    late[0] = late[0] + 1
+            kind = kind & 127
+            if kind == WEIGHT:
+                weight_target_q28[queue_index[n]] = queue_value[n]
+            elif kind == LIVE:
+                live_target_q28[queue_index[n]] = queue_value[n]
+            else:
+                tempo_q16[0] = queue_value[n]
+        else:
+            if kept != n:
+                queue_frame[kept] = queue_frame[n]
+                queue_kind[kept] = queue_kind[n]
+                queue_index[kept] = queue_index[n]
+                queue_value[kept] = queue_value[n]
+            kept += 1
+        n += 1
+    return kept
+
+
+class Cues:
+    """The queue of stamped targets; `late[0]` counts targets that came after their frame and acted at once."""
+
+    def __init__(self):
+        self.count = 0
+        self.late = array("i", (0,))
+        self._frame = array("i", bytes(4 * QUEUE_MAX))
+        self._kind = bytearray(QUEUE_MAX)
+        self._index = bytearray(QUEUE_MAX)
+        self._value = array("i", bytes(4 * QUEUE_MAX))
+
+    def clear(self):
+        """Forget all that wait."""
+        self.count = 0
+
+    def put(self, kind, body, start, length, indices, ack):
+        """Queue the targets of a payload (`length` bytes at `body[start]`: stamp, then items of index and value); return a status.
+
+        `indices` is the number of actions or live channels. `ack.detail` gets the number of the bad field, or the free places.
+        """
+        items = (length - 4) // 5
+        if self.count + items > QUEUE_MAX:
+            ack.detail = QUEUE_MAX - self.count
+            return messages.FULL
+        if kind == TEMPO:
+            first, indices = MASTER, 1
+            least, most = MASTER_TEMPO_MIN_Q16, MASTER_TEMPO_MAX_Q16
+        else:
+            first = least = 0
+            most = WEIGHT_MAX if kind == WEIGHT else WEIGHT_ONE
+        # fmt: off
+        bad = _put(
+            body, start, items, kind, first, indices, least, most,
+            self._frame, self._kind, self._index, self._value, self.count,
+        )
+        # fmt: on
+        if bad >= 0:
+            ack.detail = bad
+            return messages.RANGE
+        self.count += items
+        return messages.OK
+
+    def apply(self, frame, weight_target_q28, live_target_q28, tempo_q16):
+        """Let the targets due in `frame` act on the arrays; `tempo_q16[0]` is the master tempo."""
+        # fmt: off
+        self.count = _apply(
+            frame, self.count, self._frame, self._kind, self._index, self._value,
+            weight_target_q28, live_target_q28, tempo_q16, self.late,
+        )
+        # fmt: on

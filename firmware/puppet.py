@@ -1,0 +1,151 @@
+"""The puppet: its tables, its state, and one frame through all layers.
+
+Data runs one way: targets, weights, actions, functions, compositor, motor, board. Each layer is a kernel over arrays that are made
+here once; a frame allocates nothing.
+"""
+
+from firmware import actions, clock, compositor, functions, weights
+from firmware.cues import Cues
+from firmware.motor import Motor
+from firmware.tables import Tables, halves, words
+from shared.formats import (
+    ACTIONS_MAX,
+    DOFS_MAX,
+    GRADIENTS,
+    LIVES_MAX,
+    MAPPINGS_MAX,
+    NOISE_TABLES,
+    TEMPO_ONE,
+    WEIGHT_ONE,
+)
+
+
+class Puppet:
+    """One puppet on one board.
+
+    `frame` is the number of the next frame, -1 while the motion does not run. `base_q15` and `signal_q15` hold the last
+    frame's values per DOF, after the compositor and after signal processing; `motor.motor_q15` what the motors were told.
+    """
+
+    def __init__(self, board):
+        self.frame = -1
+        self.frame_max_us = 0
+        self.clock = clock.FrameClock()
+        self.cues = Cues()
+        self.motor = Motor(board)
+        self.tables = Tables()  # those that play
+        self.staged = Tables()  # those that the host fills
+        self.tempo_q16 = words(1)
+        self.live_target_q28 = words(LIVES_MAX)
+        self.weight_target_q28 = words(ACTIONS_MAX)
+        self.w_q28 = words(ACTIONS_MAX)
+        self.base_q15 = halves(DOFS_MAX)
+        self.signal_q15 = self.base_q15  # until a signal processing layer stands between them
+        self.playing = bytearray(ACTIONS_MAX)
+        self.found = 0
+        self._board = board
+        self._sine = functions.sine_table()
+        self._gradients = halves(NOISE_TABLES * GRADIENTS)
+        self._drawn = None
+        self._master = words(clock.PHASE_WORDS)
+        self._x_q28 = words(ACTIONS_MAX)
+        self._cycle = halves(ACTIONS_MAX)
+        self._fraction_q24 = words(ACTIONS_MAX)
+        self._live_x_q28 = words(LIVES_MAX)
+        self._live_w_q28 = words(LIVES_MAX)
+        self._hold_target_q28 = words(DOFS_MAX)
+        self._hold_x_q28 = words(DOFS_MAX)
+        self._hold_w_q28 = words(DOFS_MAX)
+        self._hold_q15 = halves(DOFS_MAX)
+        self._value_q15 = halves(MAPPINGS_MAX)
+        self._wanted = bytearray(DOFS_MAX)
+        self._weight_sum = words(DOFS_MAX)
+        self._upper = words(DOFS_MAX)
+        self._lower = words(DOFS_MAX)
+
+    def commit(self):
+        """Exchange the staged tables for those that play. Call it while the motion stands, with a complete set."""
+        self.tables, self.staged = self.staged, self.tables
+        self.staged.ready = False
+        tables = self.tables
+        noise = (tables.seed, tables.spread_q15)
+        if noise != self._drawn:
+            functions.fill_gradients(self._gradients, tables.seed, tables.spread_q15)
+            self._drawn = noise
+        self.motor.load(tables)
+        self._rest()
+
+    def start(self):
+        """Begin the motion anew: frame 0 is due now. Targets that wait keep their stamps."""
+        self._rest()
+        self.frame = 0
+        self.frame_max_us = 0
+        self.cues.late[0] = 0
+        self.clock.start(self._board.ticks_us(), self.tables.frame_rate_hz)
+
+    def stop(self):
+        """Stand still: no more frames, relative DOFs at 0, absolute DOFs where they are."""
+        if self.frame >= 0:
+            self.motor.stand()
+        self.frame = -1
+        self.cues.clear()
+
+    def step(self, silent):
+        """Compute the frame that is due and bring it to the motors; `silent` tells that the link has been quiet too long."""
+        begun_us = self._board.ticks_us()
+        self.clock.begin(begun_us)
+        self._synthesise()
+        self.motor.move(self.signal_q15, silent)
+        clock.advance(self._master, self.tempo_q16[0], self.clock.rate_hz)
+        self.frame += 1
+        took_us = clock.ticks_diff(self._board.ticks_us(), begun_us)
+        if took_us > self.frame_max_us:
+            self.frame_max_us = took_us
+
+    # fmt: off
+    def _synthesise(self):
+        t = self.tables
+        self.cues.apply(self.frame, self.weight_target_q28, self.live_target_q28, self.tempo_q16)
+        compositor.hold_targets(
+            t.actions, self.weight_target_q28, t.first_mapping, t.mapping_count, t.mapped_dof,
+            t.dofs, t.relative, self.base_q15, self._hold_target_q28, self._hold_w_q28, self._hold_q15, self._wanted,
+        )
+        weights.integrate(t.actions, self.weight_target_q28, self._x_q28, self.w_q28, t.rise_q26, t.fall_q26)
+        weights.integrate(
+            t.lives, self.live_target_q28, self._live_x_q28, self._live_w_q28, t.live_rise_q26, t.live_fall_q26
+        )
+        weights.integrate(
+            t.dofs, self._hold_target_q28, self._hold_x_q28, self._hold_w_q28, t.hold_q26, t.hold_q26
+        )
+        found = actions.select(t.actions, self.weight_target_q28, self._x_q28, self.w_q28, self.playing)
+        actions.phases(
+            self.playing, found, self._master, self.clock.rate_hz, t.tempo_q16, self._cycle, self._fraction_q24
+        )
+        functions.evaluate(
+            self.playing, found, self._cycle, self._fraction_q24, t.first_mapping, t.mapping_count, t.function,
+            t.argument, self._sine, self._gradients, self._live_w_q28, self._value_q15,
+        )
+        compositor.blend(
+            self.playing, found, self.w_q28, t.first_mapping, t.mapping_count, t.mapped_dof, t.low_q15, t.high_q15,
+            self._value_q15, t.dofs, self._hold_w_q28, self._hold_q15, self.base_q15,
+            self._weight_sum, self._upper, self._lower,
+        )
+        self.found = found
+    # fmt: on
+
+    def _rest(self):
+        """Set all state to what holds before frame 0: no action, HOLD at rest, live channels at rest, tempo 1, phase 0."""
+        tables = self.tables
+        self.frame = -1
+        self.found = 0
+        self.tempo_q16[0] = TEMPO_ONE
+        for place in range(clock.PHASE_WORDS):
+            self._master[place] = 0
+        for action in range(ACTIONS_MAX):
+            self.weight_target_q28[action] = self._x_q28[action] = self.w_q28[action] = 0
+        for live in range(tables.lives):
+            rest_q28 = tables.live_rest_q28[live]
+            self.live_target_q28[live] = self._live_x_q28[live] = self._live_w_q28[live] = rest_q28
+        for dof in range(tables.dofs):
+            self._hold_target_q28[dof] = self._hold_x_q28[dof] = self._hold_w_q28[dof] = WEIGHT_ONE
+            self._hold_q15[dof] = self.base_q15[dof] = tables.rest_q15[dof]

@@ -1,0 +1,224 @@
+"""A puppet's tables: plain integer arrays, filled over the link, checked before they are played.
+
+There are two sets, one that plays and one that is being filled; `commit` of a complete set exchanges them. Every index that a
+kernel will use is checked here, because viper checks nothing. All arrays have room for the largest puppet.
+"""
+
+from array import array
+
+from shared.formats import (
+    ACTIONS_MAX,
+    ALPHA_ONE,
+    DOFS_MAX,
+    FRAME_RATE_MAX_HZ,
+    FRAME_RATE_MIN_HZ,
+    FUNCTION_CONST,
+    FUNCTION_LIVE,
+    FUNCTION_NOISE,
+    KIND_RELATIVE,
+    LIVES_MAX,
+    MAPPINGS_MAX,
+    NO_PIN,
+    NOISE_TABLES,
+    PULSE_BITS,
+    PULSE_MAX_US,
+    PULSE_MIN_US,
+    TEMPO_MAX_Q16,
+    TEMPO_MIN_Q16,
+    VALUE_ONE,
+    WEIGHT_ONE,
+)
+
+_PULSE_MIN_Q4US = PULSE_MIN_US << PULSE_BITS
+_PULSE_MAX_Q4US = PULSE_MAX_US << PULSE_BITS
+
+
+def words(count):
+    """Return an array of `count` signed 32-bit words, all 0."""
+    return array("i", bytes(4 * count))
+
+
+def halves(count):
+    """Return an array of `count` unsigned 16-bit words, all 0."""
+    return array("H", bytes(2 * count))
+
+
+class Tables:
+    """One set of tables. The methods `begin`, `dof` .. `live` store one message's fields and return None, or the number of the field
+    that is out of range. Order: `begin`, then `dof` 0, 1, .., `action` 0, 1, .., `mappings`, `live`, each in its place exactly once.
+    """
+
+    def __init__(self):
+        self.ready = False
+        self.frame_rate_hz = 30
+        self.dofs = self.actions = self.mappings = self.lives = 0
+        self.seed = 0
+        self.spread_q15 = 0
+        self.link_timeout_ms = 500
+        self._dofs_seen = self._actions_seen = self._mappings_seen = self._lives_seen = 0
+        # per DOF
+        self.relative = bytearray(DOFS_MAX)
+        self.rest_q15 = halves(DOFS_MAX)
+        self.hold_q26 = words(DOFS_MAX)
+        self.limit_low_q15 = halves(DOFS_MAX)
+        self.limit_high_q15 = halves(DOFS_MAX)
+        self.pin = bytearray(DOFS_MAX)
+        self.pulse0_q4us = halves(DOFS_MAX)
+        self.pulse1_q4us = halves(DOFS_MAX)
+        # per action
+        self.tempo_q16 = words(ACTIONS_MAX)
+        self.rise_q26 = words(ACTIONS_MAX)
+        self.fall_q26 = words(ACTIONS_MAX)
+        self.first_mapping = halves(ACTIONS_MAX)
+        self.mapping_count = bytearray(ACTIONS_MAX)
+        # per mapping
+        self.mapped_dof = bytearray(MAPPINGS_MAX)
+        self.function = bytearray(MAPPINGS_MAX)
+        self.argument = halves(MAPPINGS_MAX)
+        self.low_q15 = halves(MAPPINGS_MAX)
+        self.high_q15 = halves(MAPPINGS_MAX)
+        # per live channel
+        self.live_rest_q28 = words(LIVES_MAX)
+        self.live_rise_q26 = words(LIVES_MAX)
+        self.live_fall_q26 = words(LIVES_MAX)
+
+    def begin(self, frame_rate_hz, dofs, actions, mappings, lives, seed, spread_q15, hold_q26, link_timeout_ms):
+        """Empty the set and announce what will come."""
+        self.ready = False
+        for number, (value, least, most) in enumerate(
+            (
+                (frame_rate_hz, FRAME_RATE_MIN_HZ, FRAME_RATE_MAX_HZ),
+                (dofs, 1, DOFS_MAX),
+                (actions, 0, ACTIONS_MAX),
+                (mappings, 0, MAPPINGS_MAX),
+                (lives, 0, LIVES_MAX),
+                (seed, 0, 0xFFFFFFFF),
+                (spread_q15, 0, VALUE_ONE),
+                (hold_q26, 1, ALPHA_ONE - 1),
+                (link_timeout_ms, 100, 60000),
+            )
+        ):
+            if not least <= value <= most:
+                return number
+        self.frame_rate_hz = frame_rate_hz
+        self.dofs = dofs
+        self.actions = actions
+        self.mappings = mappings
+        self.lives = lives
+        self.seed = seed
+        self.spread_q15 = spread_q15
+        for dof in range(DOFS_MAX):
+            self.hold_q26[dof] = hold_q26
+        self.link_timeout_ms = link_timeout_ms
+        self._dofs_seen = self._actions_seen = self._mappings_seen = self._lives_seen = 0
+        self.ready = True
+        return None
+
+    def dof(self, dof, kind, rest_q15, low_q15, high_q15):
+        """Store a DOF; it drives nothing until `output` gives it a pin."""
+        if dof != self._dofs_seen or dof >= self.dofs:
+            return 0
+        if kind > KIND_RELATIVE:
+            return 1
+        if high_q15 > VALUE_ONE:
+            return 4
+        if low_q15 > high_q15:
+            return 3
+        if rest_q15 > VALUE_ONE:
+            return 2
+        self.relative[dof] = kind
+        self.rest_q15[dof] = VALUE_ONE // 2 if kind == KIND_RELATIVE else rest_q15
+        self.limit_low_q15[dof] = low_q15
+        self.limit_high_q15[dof] = high_q15
+        self.pin[dof] = NO_PIN
+        self._dofs_seen += 1
+        return None
+
+    def output(self, dof, pin, pulse0_q4us, pulse1_q4us, board):
+        """Give a stored DOF its pin and the pulse widths at value 0 and at value 1 (either may be the larger)."""
+        if dof >= self._dofs_seen:
+            return 0
+        if not board.is_output(pin):
+            return 1
+        for other in range(self._dofs_seen):
+            if other != dof and self.pin[other] != NO_PIN and board.clash(pin, self.pin[other]):
+                return 1
+        if not _PULSE_MIN_Q4US <= pulse0_q4us <= _PULSE_MAX_Q4US:
+            return 2
+        if not _PULSE_MIN_Q4US <= pulse1_q4us <= _PULSE_MAX_Q4US:
+            return 3
+        self.pin[dof] = pin
+        self.pulse0_q4us[dof] = pulse0_q4us
+        self.pulse1_q4us[dof] = pulse1_q4us
+        return None
+
+    def action(self, action, tempo_q16, rise_q26, fall_q26, first_mapping, mappings):
+        """Store an action; its mappings are `first_mapping` .. `first_mapping + mappings - 1`."""
+        if action != self._actions_seen or action >= self.actions:
+            return 0
+        if not TEMPO_MIN_Q16 <= tempo_q16 <= TEMPO_MAX_Q16:
+            return 1
+        if not 0 < rise_q26 < ALPHA_ONE:
+            return 2
+        if not 0 < fall_q26 < ALPHA_ONE:
+            return 3
+        if first_mapping + mappings > self.mappings:
+            return 4
+        if mappings > DOFS_MAX:
+            return 5
+        self.tempo_q16[action] = tempo_q16
+        self.rise_q26[action] = rise_q26
+        self.fall_q26[action] = fall_q26
+        self.first_mapping[action] = first_mapping
+        self.mapping_count[action] = mappings
+        self._actions_seen += 1
+        return None
+
+    def mapping(self, mapping, dof, function, argument, low_q15, high_q15):
+        """Store a mapping. The field numbers count from the item's `dof`, 0; a mapping out of its place is field 0."""
+        if mapping != self._mappings_seen or mapping >= self.mappings or dof >= self.dofs:
+            return 0
+        if function > FUNCTION_LIVE:
+            return 1
+        if (
+            (function == FUNCTION_NOISE and argument >= NOISE_TABLES)
+            or (function == FUNCTION_CONST and argument > VALUE_ONE)
+            or (function == FUNCTION_LIVE and argument >= self.lives)
+        ):
+            return 2
+        if low_q15 > VALUE_ONE:
+            return 3
+        if high_q15 > VALUE_ONE:
+            return 4
+        self.mapped_dof[mapping] = dof
+        self.function[mapping] = function
+        self.argument[mapping] = argument
+        self.low_q15[mapping] = low_q15
+        self.high_q15[mapping] = high_q15
+        self._mappings_seen += 1
+        return None
+
+    def live(self, live, rest_q28, rise_q26, fall_q26):
+        """Store a live channel."""
+        if live != self._lives_seen or live >= self.lives:
+            return 0
+        if rest_q28 > WEIGHT_ONE:
+            return 1
+        if not 0 < rise_q26 < ALPHA_ONE:
+            return 2
+        if not 0 < fall_q26 < ALPHA_ONE:
+            return 3
+        self.live_rest_q28[live] = rest_q28
+        self.live_rise_q26[live] = rise_q26
+        self.live_fall_q26[live] = fall_q26
+        self._lives_seen += 1
+        return None
+
+    def missing(self):
+        """Return how many of the announced parts have not come."""
+        return (
+            (self.dofs - self._dofs_seen)
+            + (self.actions - self._actions_seen)
+            + (self.mappings - self._mappings_seen)
+            + (self.lives - self._lives_seen)
+        )

@@ -1,0 +1,264 @@
+"""The host's end of the link: reliable commands over a byte stream that may lose or damage bytes.
+
+`Link` does the protocol and nothing else: it is handed a carrier for its bytes and its clock, so the same code works in real time over
+a serial port and in virtual time with an emulated MCU.
+
+Commands are numbered and carried out by the MCU in their order, each once; up to WINDOW of them are under way. What is not
+acknowledged within RETRY_US is sent again, with all that follow it. Telemetry is not acknowledged: what is lost of it is lost.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from marotte.errors import MarotteError
+from marotte.mcu.base import VirtualMcu
+from shared import codec, messages
+
+WINDOW = 8
+RETRY_US = 100_000
+HURRY_US = 5_000
+"""A gap that the MCU reports is filled at once, but not twice within this: all that follow it report it too."""
+
+SILENT_US = 1_000_000
+"""With commands under way and no packet for so long, the MCU counts as gone."""
+
+_BY_NAME = {message[0]: message for message in messages.MESSAGES}
+_BY_ID = {message[1]: message for message in messages.MESSAGES}
+
+
+class LinkError(MarotteError):
+    """The link does not work, or the MCU refused a command."""
+
+
+class LinkSilent(LinkError):
+    """Nothing, or nothing that is a packet, has come for too long."""
+
+
+class LinkRefused(LinkError):
+    """The MCU refused a command. `status` and `detail` are those of its acknowledgement."""
+
+    def __init__(self, text: str, status: int, detail: int):
+        super().__init__(text)
+        self.status = status
+        self.detail = detail
+
+
+class Carrier(Protocol):
+    """What takes the link's bytes to an MCU and back."""
+
+    def now_us(self) -> int:
+        """Return the time in microseconds, from any beginning."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+
+    def read(self, wait_us: int) -> bytes:
+        """Let at most `wait_us` pass; return what has arrived, empty if nothing has."""
+
+    def close(self) -> None:
+        """Let go of the MCU."""
+
+
+class VirtualCarrier:
+    """An emulated MCU in virtual time as a carrier: time passes in `read`, all of `wait_us`."""
+
+    def __init__(self, mcu: VirtualMcu):
+        self.mcu = mcu
+
+    def now_us(self) -> int:
+        return self.mcu.now_us
+
+    def write(self, data: bytes) -> None:
+        self.mcu.send(data)
+
+    def read(self, wait_us: int) -> bytes:
+        self.mcu.run_for(wait_us)
+        return b"".join(data for _, data in self.mcu.receive())
+
+    def close(self) -> None:
+        self.mcu.close()
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message that has come from the MCU: its fields by name, and the fields of each of its items."""
+
+    name: str
+    fields: dict[str, int]
+    items: list[dict[str, int]]
+
+
+@dataclass
+class Counters:
+    """What a link has seen since it was made."""
+
+    sent: int = 0
+    repeated: int = 0
+    received: int = 0
+    damaged: int = 0
+    bytes: int = 0
+
+
+@dataclass
+class _Command:
+    seq: int
+    name: str
+    packet: bytes
+    sent_us: int
+    on_refused: Callable[[int, int], None] | None
+
+
+def pack(name: str, fields: dict[str, int], items: list[dict[str, int]] | None = None) -> bytes:
+    """Return a message's payload. Raises ValueError, with message and field, for a missing field or one out of its type's range."""
+    _, _, field_pairs, item_pairs = _BY_NAME[name]
+    parts = [_pack_pairs(name, field_pairs, fields)]
+    parts += [_pack_pairs(name, item_pairs, item) for item in items or []]
+    return b"".join(parts)
+
+
+def unpack(message_id: int, payload: bytes) -> Message | None:
+    """Return the message that a payload holds; None if there is none of that id or its length does not fit."""
+    message = _BY_ID.get(message_id)
+    if message is None or not messages.length_fits(message, len(payload)):
+        return None
+    name, _, field_pairs, item_pairs = message
+    fields = _unpack_pairs(field_pairs, payload, 0)
+    start = messages.size(field_pairs)
+    step = messages.size(item_pairs) or 1
+    items = [_unpack_pairs(item_pairs, payload, place) for place in range(start, len(payload), step)]
+    return Message(name, fields, items)
+
+
+def wire_packet(message_id: int, seq: int, payload: bytes) -> bytes:
+    """Return a packet as it goes over the wire, with the zero that ends it."""
+    body = bytearray(codec.BODY_MAX)
+    length = codec.OVERHEAD - 4 + len(payload)
+    body[:length] = bytes((message_id, seq)) + payload
+    length = codec.seal(body, length)
+    wire = bytearray(codec.WIRE_MAX)
+    return bytes(wire[: codec.encode(body, length, wire)])
+
+
+class Link:
+    """Commands out, messages in. `on_message` is called with every message but acknowledgements."""
+
+    def __init__(self, carrier: Carrier, on_message: Callable[[Message], None]):
+        self.counters = Counters()
+        self.heard_us = carrier.now_us()
+        self._carrier = carrier
+        self._on_message = on_message
+        self._seq = 0
+        self._backlog: deque[_Command] = deque()
+        self._under_way: deque[_Command] = deque()
+        self._partial = b""
+
+    @property
+    def pending(self) -> int:
+        """How many commands are not acknowledged yet."""
+        return len(self._backlog) + len(self._under_way)
+
+    def post(
+        self,
+        name: str,
+        fields: dict[str, int] | None = None,
+        items: list[dict[str, int]] | None = None,
+        on_refused: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Send a command, at once if the window allows. `on_refused(status, detail)` is called if the MCU refuses it; without, `pump` raises LinkRefused."""
+        packet = wire_packet(_BY_NAME[name][1], self._seq, pack(name, fields or {}, items))
+        self._backlog.append(_Command(self._seq, name, packet, 0, on_refused))
+        self._seq = (self._seq + 1) & 255
+        self._send_what_fits()
+
+    def pump(self, wait_us: int) -> None:
+        """Let at most `wait_us` pass; take what has come, repeat what was lost. Raises LinkSilent and LinkRefused."""
+        data = self._carrier.read(wait_us)
+        if data:
+            self.counters.bytes += len(data)
+            *packets, self._partial = (self._partial + data).split(b"\0")
+            self._partial = self._partial[-4 * codec.WIRE_MAX :]
+            for packet in packets:
+                self._take(packet)
+        now_us = self._carrier.now_us()
+        if self._under_way:
+            if now_us - self.heard_us > SILENT_US:
+                raise LinkSilent(f"the MCU has not answered for {SILENT_US / 1e6:g} s")
+            if now_us - self._under_way[0].sent_us > RETRY_US:
+                self._repeat(now_us)
+        self._send_what_fits()
+
+    def forget(self) -> None:
+        """Drop all commands that are not acknowledged: for a new session."""
+        self._backlog.clear()
+        self._under_way.clear()
+
+    def _send_what_fits(self) -> None:
+        if not self._under_way:
+            self.heard_us = self._carrier.now_us()  # silence begins with the first command that waits for an answer
+        while self._backlog and len(self._under_way) < WINDOW:
+            command = self._backlog.popleft()
+            command.sent_us = self._carrier.now_us()
+            self._under_way.append(command)
+            self._carrier.write(command.packet)
+            self.counters.sent += 1
+
+    def _repeat(self, now_us: int) -> None:
+        for command in self._under_way:
+            command.sent_us = now_us
+            self._carrier.write(command.packet)
+            self.counters.repeated += 1
+
+    def _take(self, packet: bytes) -> None:
+        if not packet:
+            return
+        body = bytearray(packet)
+        length = codec.decode(body, len(body))
+        if length < 0 or not codec.is_sealed(body, length):
+            self.counters.damaged += 1
+            return
+        message = unpack(body[0], bytes(body[2 : length - 4]))
+        if message is None:
+            self.counters.damaged += 1
+            return
+        self.heard_us = self._carrier.now_us()
+        self.counters.received += 1
+        if message.name == "ack":
+            self._acknowledged(message.fields["seq"], message.fields["status"], message.fields["detail"])
+        else:
+            self._on_message(message)
+
+    def _acknowledged(self, seq: int, status: int, detail: int) -> None:
+        if status == messages.RESEND:
+            now_us = self._carrier.now_us()
+            first = self._under_way[0] if self._under_way else None
+            if first and first.seq == detail & 255 and now_us - first.sent_us > HURRY_US:
+                self._repeat(now_us)
+            return
+        if not self._under_way or self._under_way[0].seq != seq:
+            return  # answered before, or one before it is still missing: the repetition will tell
+        command = self._under_way.popleft()
+        if status == messages.OK:
+            return
+        if command.on_refused is None:
+            text = messages.STATUS_TEXT[status] if status < len(messages.STATUS_TEXT) else f"status {status}"
+            raise LinkRefused(f"the MCU refused {command.name!r}: {text} (detail {detail})", status, detail)
+        command.on_refused(status, detail)
+
+
+def _pack_pairs(name: str, pairs: tuple[tuple[str, str], ...], values: dict[str, int]) -> bytes:
+    if set(values) != {field for field, _ in pairs}:
+        raise ValueError(f"message {name!r} has the fields {[field for field, _ in pairs]}, not {list(values)}")
+    try:
+        return struct.pack(messages.struct_format(pairs), *(values[field] for field, _ in pairs))
+    except struct.error as error:
+        raise ValueError(f"message {name!r}: {error}: {values}") from None
+
+
+def _unpack_pairs(pairs: tuple[tuple[str, str], ...], payload: bytes, start: int) -> dict[str, int]:
+    values = struct.unpack_from(messages.struct_format(pairs), payload, start)
+    return {field: value for (field, _), value in zip(pairs, values, strict=True)}
