@@ -94,7 +94,7 @@ class _Reader:
         name = root.text("name", self.document.path.stem)
         frame_rate_hz = root.integer("frame_rate", formats.FRAME_RATE_MIN_HZ, formats.FRAME_RATE_MAX_HZ, 30)
         seed = root.integer("seed", 0, SEED_MAX, Puppet.seed)
-        noise_spread = root.number("noise_spread", 0, 1, 0)
+        noise_spread = root.number("noise_spread", 0, 1, 0.0)
         when_silent = root.choice("when_silent", ("idle", "rest", "relax"), "idle")
         if when_silent != "idle":
             root.not_yet("when_silent", "when_silent")
@@ -201,7 +201,7 @@ class _Reader:
     def action(self, table: Table, name: str) -> Action:
         if name == MASTER_NAME:
             table.mistake(f'"{MASTER_NAME}" names the master tempo in scores; expected another name')
-        tempo = table.number("tempo", *TEMPO_RANGE, default=1)
+        tempo = table.number("tempo", *TEMPO_RANGE, default=1.0)
         tau_s = _tau(table, Action.tau_s)
         entry = table.choice("entry", ("sync", "start"), "sync")
         if entry == "start":
@@ -261,7 +261,7 @@ class _Reader:
         return function
 
     def mood(self, table: Table, name: str) -> Mood:
-        tempo = table.number("tempo", *MASTER_TEMPO_RANGE, default=1) if table.has("tempo") else None
+        tempo = table.number("tempo", *MASTER_TEMPO_RANGE, default=1.0) if table.has("tempo") else None
         mood = Mood(name, gains(table), tempo)
         table.finish()
         return mood

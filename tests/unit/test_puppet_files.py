@@ -1,0 +1,441 @@
+"""Puppet files: what is read, and that every mistake is found, named and placed."""
+
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from marotte.functions import Function, FunctionError, parse_function
+from marotte.positions import line_numbers
+from marotte.puppet_file import load_puppet, read_puppet
+from marotte.supported import NOT_YET
+from marotte.tomlfile import FileMistakes, key_text
+
+PET = Path(__file__).parents[2] / "puppets" / "pet.toml"
+
+GOOD = """
+name = "test"
+frame_rate = 25
+seed = 7
+noise_spread = 0.5
+[dof.NECK]
+rest = 0.25
+limits = [0.1, 0.9]
+signal = false
+[dof.WHEEL]
+kind = "relative"
+[live.GAZE]
+rest = 0.75
+tau = [0.2, 0.3]
+[action.NOD]
+tempo = 2
+tau = 0.5
+map = [ ["NECK", 0.9, 0.1, "noise16"], ["WHEEL", -1, 1.0, "live(GAZE)"] ]
+[action.STILL]
+map = [ ["NECK", 0.5, 0.5, "const(0.25)"], ["WHEEL", 0, 0, "live(UNDECLARED)"] ]
+[behaviour.HAPPY]
+NOD = 4
+STILL = 0.05
+[mood.CALM]
+gains = [1, 1, 1, 1, 1, 1.0, 1]
+tempo = 0.25
+"""
+
+
+def mistakes_of(tmp_path, text):
+    path = tmp_path / "puppet.toml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    puppet, mistakes = read_puppet(path)
+    if mistakes:
+        with pytest.raises(FileMistakes):
+            load_puppet(path)
+    return [str(mistake).removeprefix(str(path)) for mistake in mistakes]
+
+
+def test_puppet_reads_everything(tmp_path):
+    path = tmp_path / "p.toml"
+    path.write_text(GOOD)
+    puppet = load_puppet(path)
+    assert (puppet.name, puppet.frame_rate_hz, puppet.seed, puppet.noise_spread) == ("test", 25, 7, 0.5)
+    neck, wheel = puppet.dofs.values()
+    assert (neck.rest, neck.limits, neck.signal, neck.is_relative) == (0.25, (0.1, 0.9), False, False)
+    assert (wheel.rest, wheel.limits, wheel.signal, wheel.is_relative) == (0.0, (-1.0, 1.0), False, True)
+    nod, still = puppet.actions.values()
+    assert (nod.tempo, nod.tau_s, nod.entry) == (2.0, (0.5, 0.5), "sync")
+    assert (still.tempo, still.tau_s) == (1.0, (0.25, 0.25))
+    assert nod.mappings[0].function == Function("noise", (16,))
+    assert (nod.mappings[0].low, nod.mappings[0].high) == (0.9, 0.1)
+    assert nod.mappings[1].function == Function("live", ("GAZE",))
+    assert still.mappings[0].function == Function("const", (0.25,))
+    assert list(puppet.lives) == ["GAZE", "UNDECLARED"]
+    assert puppet.lives["GAZE"].tau_s == (0.2, 0.3)
+    assert (puppet.lives["UNDECLARED"].rest, puppet.lives["UNDECLARED"].tau_s) == (0.5, (0.1, 0.1))
+    assert puppet.behaviours["HAPPY"] == {"NOD": 4.0, "STILL": 0.05}
+    assert (puppet.moods["CALM"].gains, puppet.moods["CALM"].tempo) == ((1.0,) * 7, 0.25)
+    assert (puppet.action_index("STILL"), puppet.live_index("UNDECLARED")) == (1, 1)
+
+
+def test_puppet_defaults_are_those_of_the_documentation(tmp_path):
+    path = tmp_path / "bare.toml"
+    path.write_text("[dof.NECK]\n")
+    puppet = load_puppet(path)
+    assert (puppet.name, puppet.frame_rate_hz, puppet.noise_spread) == ("bare", 30, 0.0)
+    neck = puppet.dofs["NECK"]
+    assert (neck.kind, neck.rest, neck.limits, neck.signal, neck.character) == ("absolute", 0.5, (0, 1), True, None)
+
+
+def test_puppet_pet_is_complete():
+    puppet = load_puppet(PET)
+    expected = "EYEBROW EYELID UPPERLIP LOWERLIP HEAD_YAW HEAD_PITCH NECK WHEEL_LEFT WHEEL_RIGHT BACK"
+    assert list(puppet.dofs) == expected.split()
+    assert [dof.name for dof in puppet.dofs.values() if dof.is_relative] == ["WHEEL_LEFT", "WHEEL_RIGHT"]
+    assert {"NEUTRAL_HEAD", "NEUTRAL_BODY", "HAPPY_FACE", "PIGEON_WALK"} < set(puppet.actions)
+    moved = {entry.dof for action in puppet.actions.values() for entry in action.mappings}
+    assert moved == set(puppet.dofs)
+
+
+# Text to append to or to put in the place of lines of GOOD, and what has to be said about it.
+MISTAKES = [
+    # the outermost keys
+    ('name = "test"', "name = 3", ":2 name: found 3, expected a text"),
+    ("frame_rate = 25", "frame_rate = 9", ":3 frame_rate: found 9, expected a whole number in 10..60"),
+    ("frame_rate = 25", "frame_rate = 61", ":3 frame_rate: found 61, expected a whole number in 10..60"),
+    ("frame_rate = 25", "frame_rate = 30.0", ":3 frame_rate: found 30.0, expected a whole number in 10..60"),
+    ("frame_rate = 25", "frame_rate = true", ":3 frame_rate: found true, expected a whole number in 10..60"),
+    ("seed = 7", "seed = -1", ":4 seed: found -1, expected a whole number in 0..4294967295"),
+    ("seed = 7", "sed = 7", ':4 sed: unknown key; did you mean "seed"?'),
+    ("seed = 7", "xyzzy = 7", ":4 xyzzy: unknown key; expected "),
+    ("noise_spread = 0.5", "noise_spread = 1.01", ":5 noise_spread: found 1.01, expected a number in 0..1"),
+    ("noise_spread = 0.5", "noise_spread = nan", ":5 noise_spread: found NaN, expected a number in 0..1"),
+    ("noise_spread = 0.5", "noise_spread = inf", ":5 noise_spread: found Infinity, expected a number in 0..1"),
+    ("seed = 7", 'when_silent = "sleep"', ':4 when_silent: found "sleep", expected "idle" or "rest" or "relax"'),
+    # DOFs
+    ("rest = 0.25", "rest = -0.1", ":7 dof.NECK.rest: found -0.1, expected a number in 0..1"),
+    ("rest = 0.25", 'rest = "up"', ':7 dof.NECK.rest: found "up", expected a number in 0..1'),
+    ("rest = 0.25", "rest = true", ":7 dof.NECK.rest: found true, expected a number in 0..1"),
+    (
+        "limits = [0.1, 0.9]",
+        "limits = [0.9, 0.1]",
+        ":8 dof.NECK.limits: found [0.9, 0.1], expected the least value first",
+    ),
+    ("limits = [0.1, 0.9]", "limits = [0.1]", ":8 dof.NECK.limits: found 1 values, expected 2"),
+    ("limits = [0.1, 0.9]", "limits = 0.5", ":8 dof.NECK.limits: found 0.5, expected the least"),
+    ("limits = [0.1, 0.9]", "limits = [-1, 0.9]", ":8 dof.NECK.limits[0]: found -1, expected a number in 0..1"),
+    ("signal = false", "signal = 0", ":9 dof.NECK.signal: found 0, expected true or false"),
+    ('kind = "relative"', 'kind = "wheel"', ':11 dof.WHEEL.kind: found "wheel", expected "absolute" or "relative"'),
+    ('kind = "relative"', 'kind = "relative"\nrest = 0.5', ":12 dof.WHEEL.rest: found 0.5, expected 0"),
+    ('kind = "relative"', 'kind = "relative"\nlimits = [-1.5, 1]', ":12 dof.WHEEL.limits[0]: found -1.5"),
+    ('kind = "relative"', 'kind = "relative"\nkid = 1', ':12 dof.WHEEL.kid: unknown key; did you mean "kind"?'),
+    ("[dof.WHEEL]", '[dof."A B"]', ":10 dof.'A B': expected a name of letters, digits, _ and -"),
+    # live channels
+    ("rest = 0.75", "rest = 2", ":13 live.GAZE.rest: found 2, expected a number in 0..1"),
+    ("tau = [0.2, 0.3]", "tau = [0.2, 0.01]", ":14 live.GAZE.tau[1]: found 0.01, expected a number in 0.03..10"),
+    ("tau = [0.2, 0.3]", "tau = [0.2, 0.3, 0.4]", ":14 live.GAZE.tau: found 3 values, expected 2"),
+    ("tau = [0.2, 0.3]", 'predict = "guess"', ':14 live.GAZE.predict: found "guess", expected "hold" or "kalman"'),
+    ("[live.GAZE]", "[live.GA-ZE]", ":12 live.GA-ZE: expected a name of letters, digits and _"),
+    # actions
+    ("tempo = 2", "tempo = 0.04", ":16 action.NOD.tempo: found 0.04, expected a number in 0.05..8"),
+    ("tempo = 2", "tempo = 8.5", ":16 action.NOD.tempo: found 8.5, expected a number in 0.05..8"),
+    ("tau = 0.5", "tau = 11", ":17 action.NOD.tau: found 11, expected a number in 0.03..10"),
+    ("tau = 0.5", "warp = 0.01", ":17 action.NOD.warp: found 0.01, expected a number in 0.05..10"),
+    ("tau = 0.5", "cycles = 0", ":17 action.NOD.cycles: found 0, expected a whole number in 1..1000"),
+    ("tau = 0.5", "cycles = 2", ':17 action.NOD.cycles: only an action with entry = "start" has cycles'),
+    ("tau = 0.5", 'entry = "now"', ':17 action.NOD.entry: found "now", expected "sync" or "start"'),
+    ("[action.NOD]", "[action.global]", ':15 action.global: "global" names the master tempo'),
+    ("[action.STILL]", "[action.X]\n[action.STILL]", ':19 action.X: has no "map"; expected'),
+    ("[action.STILL]", "[action.X]\nmap = []\n[action.STILL]", ":20 action.X.map: is empty, expected"),
+    ("[action.STILL]", '[action.X]\nmap = "NECK"\n[action.STILL]', ':20 action.X.map: found "NECK", expected an array'),
+    # mappings
+    ('["NECK", 0.9,', '["NEK", 0.9,', ':18 action.NOD.map[0][0]: unknown DOF "NEK"; did you mean "NECK"?'),
+    ('["NECK", 0.9,', "[3, 0.9,", ":18 action.NOD.map[0][0]: unknown DOF 3"),
+    ('["NECK", 0.9, 0.1', '["NECK", 1.4, 0.1', ":18 action.NOD.map[0][1]: found 1.4, expected a number in 0..1"),
+    ('["NECK", 0.9, 0.1', '["NECK", 0.9, -0.1', ":18 action.NOD.map[0][2]: found -0.1, expected a number in 0..1"),
+    ('["WHEEL", -1', '["WHEEL", -1.1', ":18 action.NOD.map[1][1]: found -1.1, expected a number in -1..1"),
+    ('["WHEEL", -1', '["NECK", 1', ":18 action.NOD.map[1]: maps NECK again, expected it once; see map[0]"),
+    (
+        '["WHEEL", -1, 1.0, ',
+        '["WHEEL", -1, ',
+        ':18 action.NOD.map[1]: found ["WHEEL", -1, "live(GAZE)"], expected a map',
+    ),
+    (
+        '"noise16"',
+        '"noise17"',
+        ':18 action.NOD.map[0][3]: found "noise17": unknown function "noise17"; expected noise1 to',
+    ),
+    ('"noise16"', '"noise0"', ':18 action.NOD.map[0][3]: found "noise0": unknown function'),
+    ('"noise16"', '"rsine"', 'unknown function "rsine"; did you mean "rsin"?'),
+    ('"noise16"', '"const"', "const needs its value"),
+    ('"noise16"', '"const(1.5)"', "const has 1.5 as its value, expected a number in 0..1"),
+    ('"noise16"', '"const(1, 2)"', "expected 1 number for const, not 2"),
+    ('"noise16"', '"live"', "live needs its channel"),
+    ('"noise16"', '"live(3)"', "live has one argument, the name of a channel"),
+    ('"noise16"', '"0.5"', "a constant function is written const(0.5)"),
+    ('"noise16"', '"blink(2, 1)"', "blink has 2 as its threshold, expected a number in 0..1"),
+    ('"noise16"', '"blink(0.5, 1001)"', "blink has 1001 as its least gap, expected a number in 0..1000"),
+    ('"noise16"', '"0.5*blink(0.9, 1)"', "blink stands alone, not inside an expression"),
+    ('"noise16"', '"rsin(t"', "not a function or expression"),
+    ('"noise16"', '"rsin(t)**2"', "expected numbers, + - * /, and calls of primitives"),
+    ('"noise16"', '"open(t)"', 'unknown function "open"'),
+    ('"noise16"', "7", 'found 7: expected a function in quotes, such as "noise1"'),
+    # behaviours and moods
+    ("NOD = 4", "NOD = 4.1", ":22 behaviour.HAPPY.NOD: found 4.1, expected a number in 0..4"),
+    ("NOD = 4", "NOOD = 4", ':22 behaviour.HAPPY.NOOD: unknown action; did you mean "NOD"?'),
+    ("tempo = 0.25", "tempo = 0.2", ":26 mood.CALM.tempo: found 0.2, expected a number in 0.25..4"),
+    ("1.0, 1]", "1]", ":25 mood.CALM.gains: found 6 values, expected 7: the gains of the seven bands, highest first"),
+    ("1.0, 1]", "4.5, 1]", ":25 mood.CALM.gains[5]: found 4.5, expected a number in -4..4"),
+    # tables where there should be values, and the other way round
+    ("[dof.WHEEL]", "[dof.WHEEL.extra]", ":10 dof.WHEEL.extra: unknown key"),
+    ("seed = 7", "function = 3", ":4 function: found 3, expected a table"),
+    # TOML itself
+    ("seed = 7", "seed = ", ":4: not valid TOML: invalid value in column 8"),
+    ("seed = 7", "seed = 7\nseed = 8", ":5: not valid TOML: cannot overwrite a value"),
+    ("[dof.WHEEL]", "[dof.NECK]", ":10: not valid TOML: cannot declare"),
+    ("seed = 7", "seed = " + "9" * 5000, ": holds a number that is too long to be read"),
+    ("seed = 7", "seed = " + "[" * 100_000, ": is nested too deeply"),
+    ("noise_spread = 0.5", "noise_spread = 1e99999999999999999999", ":5 noise_spread: found Infinity"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), MISTAKES, ids=[expected[:60] for _, _, expected in MISTAKES])
+def test_puppet_mistake_is_named_and_placed(tmp_path, old, new, expected):
+    assert old in GOOD
+    found = mistakes_of(tmp_path, GOOD.replace(old, new, 1))
+    assert any(expected in line for line in found), found
+
+
+NOT_YET_CASES = [
+    ("noise16", "blink", "blink"),
+    ("noise16", "rtrigsin(0.9, 3)", "rtrigsin"),
+    ("noise16", "0.7*rsin(2*t) + 0.3*noise1(t)", "expression"),
+    ("noise16", "rsin(2*t)", "expression"),
+    ("[action.NOD]", '[function.F]\nexpr = "rsin(t)"\n[action.NOD]', "function"),
+    ("[action.NOD]", "[function.F]\ntable = [0, 0.5, 1]\n[action.NOD]", "function"),
+    ("tempo = 2", 'entry = "start"', "entry"),
+    ("tempo = 2", 'entry = "start"\ncycles = 3', "cycles"),
+    ("tempo = 2", "warp = 0.5", "warp"),
+    ("1, 1.0, 1]", "1, 1.5, 1]", "gains"),
+    ("tau = [0.2, 0.3]", 'predict = "kalman"', "kalman"),
+    ("rest = 0.25", "character = { f = 2, zeta = 0.5, r = -1 }", "character"),
+    ("seed = 7", 'when_silent = "relax"', "when_silent"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "feature"), NOT_YET_CASES)
+def test_puppet_says_what_this_version_does_not_perform(tmp_path, old, new, feature):
+    assert old in GOOD
+    found = mistakes_of(tmp_path, GOOD.replace(old, new, 1))
+    expected = [f"{NOT_YET[feature]} is not supported by this version"] if feature in NOT_YET else []
+    assert [line.split(": ", 1)[1] for line in found if feature != "cycles" or "gesture" in line] == expected
+
+
+FUNCTION_MISTAKES = [
+    ('expr = "rsin(t)"\ntable = [0, 1]', 'has both, expected one of "expr" and "table"'),
+    ("", 'has neither, expected one of "expr" and "table"'),
+    ("table = [0]", "found 1 samples, expected 2..256"),
+    ("table = [0, 1.5]", "function.F.table[1]: found 1.5, expected a number in 0..1"),
+    ('expr = "rsin(t) +"', "not a function or expression"),
+    ('expr = "rsin(t)"\nexp = 1', 'unknown key; did you mean "expr"?'),
+]
+
+
+@pytest.mark.parametrize(("body", "expected"), FUNCTION_MISTAKES)
+def test_puppet_function_mistake_is_named(tmp_path, body, expected):
+    assert any(expected in line for line in mistakes_of(tmp_path, f"{GOOD}[function.F]\n{body}\n"))
+
+
+@pytest.mark.parametrize("name", ["rsin", "noise3", "blink", "const", "t"])
+def test_puppet_function_cannot_have_a_primitives_name(tmp_path, name):
+    found = mistakes_of(tmp_path, f'{GOOD}[function.{name}]\nexpr = "rcos(t)"\n')
+    assert any("is the name of a primitive" in line for line in found)
+
+
+def test_puppet_blinking_dof_has_no_signal_processing(tmp_path):
+    text = GOOD.replace("signal = false", "signal = true").replace("noise16", "blink")
+    assert any("dof.NECK.signal: found true, expected false" in line for line in mistakes_of(tmp_path, text))
+
+
+def test_puppet_reports_all_mistakes_in_order_of_lines(tmp_path):
+    text = (
+        GOOD.replace("frame_rate = 25", "frame_rate = 5")
+        .replace("tempo = 2", "tempo = 20")
+        .replace("NOD = 4", "NOD = 40")
+    )
+    found = mistakes_of(tmp_path, text.replace('"NECK", 0.9', '"NCK", 1.9'))
+    keys = ["frame_rate", "action.NOD.tempo", "action.NOD.map[0][0]", "action.NOD.map[0][1]", "behaviour.HAPPY.NOD"]
+    assert [re.search(r" (\S+):", line)[1] for line in found] == keys
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("".join(f"[dof.D{i}]\n" for i in range(17)), "has 17 DOFs, expected at most 16"),
+        (
+            "[dof.A]\n" + "".join(f'[action.A{i}]\nmap=[["A",0,1,"rsin"]]\n' for i in range(65)),
+            "has 65 actions, expected at most 64",
+        ),
+        ("[dof.A]\n" + "".join(f"[live.L{i}]\n" for i in range(17)), "has 17 live channels, expected at most 16"),
+        (
+            "".join(f"[dof.D{i}]\n" for i in range(16))
+            + "".join(
+                f"[action.A{i}]\nmap=[" + ",".join(f'["D{j}",0,1,"rsin"]' for j in range(16)) + "]\n" for i in range(33)
+            ),
+            "has 528 mappings, expected at most 512",
+        ),
+        ("", "has no DOF, expected at least one"),
+    ],
+)
+def test_puppet_counts_are_held_to_the_capacity(tmp_path, text, expected):
+    assert any(expected in line for line in mistakes_of(tmp_path, text))
+
+
+def test_puppet_of_full_capacity_is_fine(tmp_path):
+    text = "".join(f"[dof.D{i}]\n" for i in range(16))
+    for i in range(64):
+        rows = ",".join(f'["D{(i + j) % 16}", 0, 1, "live(L{j})"]' for j in range(8))
+        text += f"[action.A{i}]\nmap = [{rows}]\n"
+    assert mistakes_of(tmp_path, text) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("absent.toml", "cannot be read: no such file"), ("", "cannot be read: is a directory")]
+)
+def test_puppet_file_that_cannot_be_read(tmp_path, name, expected):
+    _, mistakes = read_puppet(tmp_path / name)
+    assert [mistake.text for mistake in mistakes] == [f"{expected} or directory" if "no such" in expected else expected]
+
+
+def test_puppet_file_that_is_no_text(tmp_path):
+    assert mistakes_of(tmp_path, b"name = \xff\xfe") == [": found the byte 0xff, expected a text file in UTF-8"]
+
+
+def test_line_numbers_of_every_form():
+    text = """# comment with [brackets] = "x"
+top = 1
+"quoted key" = 2
+dotted.key = 3
+long = \"\"\"
+[not.a.header]
+x = 1
+\"\"\"
+raw = '''
+y = ]
+'''
+array = [ 1,  # one ]
+  [2, { a = "]", b = 3 }],
+]
+[table.inner]
+k = { x = 1,
+  y = [4,
+    5] }
+[[list]]
+k = 1
+[[list]]
+k = 2
+[list.sub]
+k = 3
+"""
+    expected = {
+        ("top",): 2,
+        ("quoted key",): 3,
+        ("dotted", "key"): 4,
+        ("long",): 5,
+        ("raw",): 9,
+        ("array",): 12,
+        ("array", 0): 12,
+        ("array", 1): 13,
+        ("array", 1, 0): 13,
+        ("array", 1, 1): 13,
+        ("array", 1, 1, "a"): 13,
+        ("array", 1, 1, "b"): 13,
+        ("table", "inner"): 15,
+        ("table", "inner", "k"): 16,
+        ("table", "inner", "k", "x"): 16,
+        ("table", "inner", "k", "y"): 17,
+        ("table", "inner", "k", "y", 0): 17,
+        ("table", "inner", "k", "y", 1): 18,
+        ("list", 0): 19,
+        ("list", 0, "k"): 20,
+        ("list", 1): 21,
+        ("list", 1, "k"): 22,
+        ("list", 1, "sub"): 23,
+        ("list", 1, "sub", "k"): 24,
+    }
+    assert line_numbers(text) == expected
+    assert line_numbers(text.replace("\n", "\r\n")) == expected
+
+
+def test_line_numbers_stop_where_they_are_unsure():
+    assert line_numbers('a = 1\n"b\\u0063" = 2\nd = 3\n') == {("a",): 1}
+
+
+KEYS = st.sampled_from(
+    ["dof", "action", "live", "mood", "behaviour", "function", "cue", "name", "seed", "map", "A", "é", "a b"]
+)
+SCALARS = st.one_of(
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=20),
+    st.sampled_from(["noise1", "live(X)", "const(0.1)", "rsin(t)", "A", "relative"]),
+)
+VALUES = st.recursive(
+    SCALARS, lambda inner: st.lists(inner, max_size=5) | st.dictionaries(KEYS, inner, max_size=4), max_leaves=20
+)
+
+
+def toml_value(value):
+    """Return a value in TOML's spelling."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return '"' + "".join(c if c.isalnum() and ord(c) < 0xD800 else f"\\U{ord(c):08x}" for c in value) + '"'
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{toml_value(key)} = {toml_value(item)}" for key, item in value.items()) + "}"
+    return repr(value)
+
+
+@given(tree=st.dictionaries(KEYS, VALUES, max_size=6), broken=st.text(max_size=3), at=st.integers(0, 400))
+def test_puppet_reader_survives_anything(tmp_path_factory, tree, broken, at):
+    text = "\n".join(f"{toml_value(key)} = {toml_value(value)}" for key, value in tree.items()).encode(
+        "utf-8", "replace"
+    )
+    path = tmp_path_factory.getbasetemp() / "any.toml"
+    path.write_bytes(text[:at] + broken.encode("utf-8", "replace") + text[at:])
+    puppet, mistakes = read_puppet(path)
+    for mistake in mistakes:
+        assert str(mistake).startswith(str(path))
+        assert "\n" not in str(mistake)
+    if not mistakes:
+        assert puppet.dofs
+
+
+@given(tree=st.dictionaries(KEYS, VALUES, max_size=6))
+def test_line_numbers_agree_with_the_text(tree):
+    lines = [f"{toml_value(key)} = {toml_value(value)}" for key, value in tree.items() if key.isalnum()]
+    found = line_numbers("\n".join(lines))
+    for path, line in found.items():
+        assert lines[line - 1].startswith(toml_value(path[0])), (path, line)
+
+
+@given(text=st.text(max_size=60) | st.text(alphabet="rsincotable()+-*/.,t0123456789 ", max_size=60))
+def test_function_text_is_a_function_or_a_mistake(text):
+    try:
+        assert parse_function(text, ["NOD"]).kind
+    except FunctionError as error:
+        assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize(
+    "text", ["(" * 400, "-" * 490, "1" * 501, "\0", "t\nt", "lambda: 1", "x:=1", "'a'", "...", "1j"]
+)
+def test_function_text_of_any_depth_is_a_mistake(text):
+    with pytest.raises(FunctionError):
+        parse_function(text)
+
+
+def test_key_text_quotes_odd_keys():
+    assert key_text(("dof", "A B", "map", 2, 1)) == "dof.'A B'.map[2][1]"
