@@ -14,6 +14,7 @@ from rich.table import Table
 from marotte import ports, wiring
 from marotte.emulated import open_mcu
 from marotte.errors import MarotteError
+from marotte.link import LinkError
 from marotte.ports import SerialCarrier
 from marotte.pulses import PulseSummary, measure
 from marotte.puppet import Puppet

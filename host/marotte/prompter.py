@@ -21,9 +21,9 @@ AHEAD_FRAMES = 30
 class Directed(Protocol):
     """The part of a session that a score needs."""
 
-    def weight_targets(self, frame: int, targets: dict[int, int]) -> None: ...
-    def live_targets(self, frame: int, targets: dict[int, int]) -> None: ...
-    def tempo(self, frame: int, action: int, tempo_q16: int) -> None: ...
+    def weight_targets(self, frame: int, targets_q28: dict[int, int]) -> None: ...
+    def live_targets(self, frame: int, targets_q28: dict[int, int]) -> None: ...
+    def tempo(self, frame: int, tempo_q16: int) -> None: ...
 
 
 class Prompter:
@@ -65,7 +65,7 @@ class Prompter:
         if step.lives:
             self._session.live_targets(step.frame, {live: weight_q28(target) for live, target in step.lives.items()})
         if step.master_tempo is not None:
-            self._session.tempo(step.frame, formats.MASTER, tempo_q16(step.master_tempo))
+            self._session.tempo(step.frame, tempo_q16(step.master_tempo))
 
 
 def _targets(step: Step) -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 
 from marotte.errors import MarotteError
-from marotte.ports import SerialCarrier
+from marotte.link import Carrier
 from marotte.prompter import Prompter
 from marotte.puppet import Puppet
 from marotte.score import Score
@@ -48,7 +48,7 @@ def default_seconds(score: Score) -> Fraction:
 def perform(
     puppet: Puppet,
     score: Score,
-    carrier: SerialCarrier,
+    carrier: Carrier,
     view: View,
     *,
     robot: Robot | None = None,
@@ -64,7 +64,6 @@ def perform(
     last_frame = round(length_s * puppet.frame_rate_hz) - 1
     session = Session(carrier)
     session.open()
-    session.stop()
     session.upload(build_tables(puppet, robot))
     session.telemetry(formats.TAP_MOTOR, _every(puppet, REFRESH_HZ), _every(puppet, WEIGHTS_HZ))
     play = _Play(puppet, score, session, view)
@@ -111,8 +110,8 @@ class _Play:
             self.scene.values = {dof.name: value_of(value_q15, dof) for dof, value_q15 in pairs}
             self.scene.frame = frame
             self._quiet_us = 0
-        weights = self.session.weights
-        self.scene.weights = {self._actions[index]: weight / WEIGHT_Q12_ONE for index, weight in weights.items()}
+        _, weights_q12 = self.session.weights
+        self.scene.weights = {self._actions[index]: weight / WEIGHT_Q12_ONE for index, weight in weights_q12.items()}
         self.scene.is_silent = self._quiet_us > SILENT_S * 1e6
         self._prompter.reached(self.scene.frame)
         self._tell_cues()

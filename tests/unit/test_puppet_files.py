@@ -47,7 +47,7 @@ tempo = 0.25
 def mistakes_of(tmp_path, text):
     path = tmp_path / "puppet.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    puppet, mistakes = read_puppet(path)
+    _, mistakes = read_puppet(path)
     if mistakes:
         with pytest.raises(FileMistakes):
             load_puppet(path)
