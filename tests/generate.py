@@ -115,7 +115,8 @@ def _random_seed(rng):
 
 
 def _random_tau(rng):
-    return rng.choice((_logarithmic(rng, 0.03, 10), [_logarithmic(rng, 0.03, 10), _logarithmic(rng, 0.03, 10)]))
+    rise_s, fall_s = (rng.choice((0.03, 10, *(_logarithmic(rng, 0.03, 10) for _ in range(4)))) for _ in range(2))
+    return rng.choice((rise_s, [rise_s, fall_s]))
 
 
 def _random_dof(rng):
@@ -216,6 +217,9 @@ def _random_cue(rng, puppet, level):
     if rng.random() < 0.7:
         some = rng.sample(actions, rng.randint(1, min(5, len(actions))))
         cue["weights"] = {name: random_target(rng) for name in some}
+        if rng.random() < 0.05:
+            # A hand-over to one faint action: where it is a slow one, the sum of weights gets very small.
+            cue["weights"] = dict.fromkeys(actions, 0) | {some[0]: _logarithmic(rng, 0.0005, 0.1)}
     if channels and rng.random() < 0.3:
         cue["live"] = {name: rng.choice((0, 1, _decimal(rng, 0, 1))) for name in rng.sample(channels, 1)}
     tempo = {}
