@@ -3,7 +3,7 @@
 set -eu
 cd "$(dirname "$0")/.."
 lock() {
-    "$1" pip compile -q --upgrade --universal --generate-hashes --python-version 3.11 --no-annotate \
+    "$1" pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \
         --custom-compile-command "make lock" "${@:2}"
 }
 lock "$1" --extra dev pyproject.toml -o requirements.lock
