@@ -4,6 +4,7 @@ import { RP2040 } from 'rp2040js';
 import { BOOT_PORT_ADDRESS, BootPort } from './boot_port.mjs';
 import { VirtualClock } from './clock.mjs';
 import { QuietLogger, correct, keepWatchdogState, onWatchdogReset } from './corrections.mjs';
+import { addCore1 } from './core1.mjs';
 import { Cpu } from './cpu.mjs';
 import { IoQspi, Ssi } from './flash.mjs';
 import { Uart } from './uart.mjs';
@@ -28,6 +29,7 @@ export class Chip {
     this.resetRequested = false;
     useMemories(this.mcu, core);
     correct(this.mcu);
+    addCore1(this.mcu);
     if (before !== null) keepWatchdogState(before.mcu, this.mcu);
     onWatchdogReset(this.mcu, () => this.requestReset());
 

@@ -7,9 +7,6 @@ const TIMER = 0x40054;
 const WATCHDOG = 0x40058;
 const ROSC = 0x40060;
 const VREG_AND_CHIP_RESET = 0x40064;
-const SIO_FIFO_ST = 0x50;
-const SIO_FIFO_RD = 0x58;
-const FIFO_READY_FOR_WRITING = 2;
 const ROSC_STATUS_STABLE = [0x18, 0x81001000];
 const ROSC_RANDOMBIT = [0x1c, 1];
 
@@ -34,7 +31,6 @@ export function correct(mcu) {
   mcu.peripherals[ROSC] = new RegisterFile(mcu, 'ROSC', ROSC_STATUS_STABLE, ROSC_RANDOMBIT);
   mcu.peripherals[VREG_AND_CHIP_RESET] = new RegisterFile(mcu, 'VREG_AND_CHIP_RESET');
   alarmOnTheMicrosecond(mcu, mcu.peripherals[TIMER]);
-  emptyCoreFifo(mcu.sio);
 }
 
 /** An alarm goes off when the counter becomes its value; rp2040js rounds the time left down, up to 1 us too early. */
@@ -47,16 +43,6 @@ function alarmOnTheMicrosecond(mcu, timer) {
     const nowMicros = Math.floor(mcu.clock.micros);
     const deltaMicros = (value - nowMicros) >>> 0;
     alarm.clockAlarm.scheduleAt((nowMicros + deltaMicros) * 1000);
-  };
-}
-
-/** The mailbox between the cores, which rp2040js does not have: empty, and nobody at the other end. */
-function emptyCoreFifo(sio) {
-  const read = sio.readUint32;
-  sio.readUint32 = (offset) => {
-    if (offset === SIO_FIFO_ST) return FIFO_READY_FOR_WRITING;
-    if (offset === SIO_FIFO_RD) return 0;
-    return read.call(sio, offset);
   };
 }
 

@@ -7,6 +7,7 @@ import json
 import select
 import subprocess
 import tempfile
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -30,6 +31,7 @@ class EmulatorProcess:
         self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors)
         assert self._process.stdin and self._process.stdout
         self._requests, self._answers = self._process.stdin, self._process.stdout
+        self._turn = threading.Lock()
         self._read()
 
     @property
@@ -41,13 +43,14 @@ class EmulatorProcess:
         return self._process.pid
 
     def ask(self, **request: object) -> dict:
-        """Send one request and return its answer."""
-        try:
-            self._requests.write(json.dumps(request).encode() + b"\n")
-            self._requests.flush()
-        except (OSError, ValueError):
-            raise self._failed("it has ended") from None
-        return self._read()
+        """Send one request and return its answer; threads take turns."""
+        with self._turn:
+            try:
+                self._requests.write(json.dumps(request).encode() + b"\n")
+                self._requests.flush()
+            except (OSError, ValueError):
+                raise self._failed("it has ended") from None
+            return self._read()
 
     def close(self) -> None:
         """End the process; calling it twice does no harm."""

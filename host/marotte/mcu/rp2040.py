@@ -44,6 +44,7 @@ class Rp2040Mcu(VirtualMcu):
             raise ValueError(f'core must be "compiled" or "js", not {core!r}')
         self.link = _checked_link(link)
         self._image = _checked_image(image)
+        self._image_sha256 = hashlib.sha256(self._image.read_bytes()).hexdigest()
         self._flash = Path(flash) if flash is not None else None
         self._now_us = 0
         self._next_us: int | None = 0
@@ -124,7 +125,7 @@ class Rp2040Mcu(VirtualMcu):
             "kind": self.kind,
             "now_us": self._now_us,
             "image": str(self._image),
-            "image_sha256": hashlib.sha256(self._image.read_bytes()).hexdigest(),
+            "image_sha256": self._image_sha256,
         }
         return facts | self._process.ask(op="report")
 

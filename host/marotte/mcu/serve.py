@@ -32,8 +32,8 @@ MAX_STEP_US = 20_000
 MAX_LAG_US = 50_000
 """An MCU that is further behind real time than this stays behind: it runs slowly, and does not hurry afterwards."""
 
-MAX_WAITING_BYTES = 4096
-"""When the client is this much behind, the MCU finds that the host does not read."""
+MAX_WAITING_BYTES = 65536
+"""When the client is this much behind, the MCU finds that the host does not read. Linux keeps as much for a serial port."""
 
 
 class LiveMcu:
