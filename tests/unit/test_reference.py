@@ -8,6 +8,7 @@ from fractions import Fraction
 import numpy
 import pytest
 
+from tests.corners import SECONDS, corners
 from tests.generate import random_puppet, random_score, to_toml
 from tests.reference import ReferencePuppet, checkpoints, render
 from tests.reference_actions import SmoothedValue, frame_of_cue, tempo_q16, whole_cycles
@@ -392,3 +393,14 @@ def test_close_decisions_are_told():
     assert reference.closest["gesture"] == pytest.approx(1 / 1024)
     assert reference.is_decided()
     assert not reference.is_decided(phase_error=1 / 512)
+
+
+def test_corners_reach_what_they_are_named_for():
+    lowest_sums = {}
+    for name, puppet, score in corners():
+        assert tomllib.loads(to_toml(puppet)) == puppet
+        base, weight_sums = render(puppet, score, SECONDS * puppet.get("frame_rate", 30))
+        assert (abs(base) <= 1 + 1e-9).all()
+        lowest_sums[name] = weight_sums.min(), weight_sums.max()
+    assert lowest_sums["faint hand-over to 0.0005 at 10 Hz"][0] < 1e-6
+    assert lowest_sums["everything at once"][1] > 255
