@@ -7,6 +7,7 @@ Phases and times are in periods, values are plain floats. A FUNCTION of a mappin
 one, `f(phase) -> 0..1`, or a `TriggeredSine`, which has a memory.
 
 Readings where the definitions leave a choice:
+- A puppet that names no seed has seed 1.
 - `table(NAME)` is `table(NAME, t)`; the bare name of a table function means the same.
 - An expression in `[function.NAME]` may be one call of `blink` or `rtrigsin`, as in a mapping.
 - `clamp` takes its bounds by place or by name; `min` and `max` take two or more arguments; the
@@ -21,6 +22,7 @@ from fractions import Fraction
 _MASK_32 = 0xFFFFFFFF
 _SEED_FACTOR = 0x9E3779B1
 _STREAM_FACTOR = 0x85EBCA77
+_DEFAULT_SEED = 1
 _GRADIENTS = 256
 _LONG_AGO_PERIODS = 2048.0
 _MARGIN_PERIODS = 1 / 1024
@@ -146,7 +148,7 @@ class FunctionCompiler:
 
     def __init__(self, puppet, read_live):
         self._functions = puppet.get("function", {})
-        self._seed = puppet.get("seed", 0)
+        self._seed = puppet.get("seed", _DEFAULT_SEED)
         self._read_live = read_live
         self._primitives = {"rsin": rsin, "rcos": rcos}
         for k in range(1, 17):
