@@ -20,6 +20,12 @@ fi
 
 # A frozen file that went away is not noticed by its time, so all are collected anew.
 rm -f "$work/build/frozen_content.c"
+make -s -j"$(nproc)" -C "$work/build" BUILD_FROZEN_CONTENT
+
+# Thumb code reads its larger constants from words that lie at multiples of 4 from the function's beginning, but MicroPython's
+# mpy-tool places frozen functions at multiples of 2: every other one would compute with wrong numbers.
+sed -i 's/__attribute__ ((aligned (2)))/__attribute__ ((aligned (4)))/' "$work/build/frozen_content.c"
+
 make -s -j"$(nproc)" -C "$work/build"
 
 cp "$work/build/firmware.elf" "$folder/"
