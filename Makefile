@@ -59,7 +59,7 @@ emulator-suite: setup ## run MicroPython's own test suite on the emulated RP2040
 	@tools/prepare.sh
 	$(VENV)/python tools/emulator_suite.py $(ARGS)
 
-lock: setup ## choose the newest packages and write the lock files
+lock: setup ## write the lock files anew
 	$(PYTHON) -m venv build/lock
 	build/lock/bin/pip install -q --disable-pip-version-check uv
 	tools/lock.sh build/lock/bin/uv

@@ -31,7 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     command: Callable[[argparse.Namespace], int] = options.command
     try:
-        return command(options)
+        status = command(options)
+        sys.stdout.flush()
+        return status
     except FileMistakes as mistakes:
         return _failed(str(mistakes), MISTAKE)
     except MarotteError as error:

@@ -49,7 +49,7 @@ def load(puppet_path: str, score_path: str, robot_path: str | None) -> Files:
 
 def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console: Console) -> None:
     """Render into a file, with a progress bar, and tell about the run. Raises MarotteError."""
-    from marotte.render import frame_count, render
+    from marotte.rendering import frame_count, render
 
     _require_writable(out)
     bar = Progress(
@@ -139,7 +139,10 @@ def _perform(
 
     length_s = float(default_seconds(files.score) if seconds is None else seconds)
     with View(files.puppet, files.robot if arm else None, where, length_s, console, quiet=no_view) as view:
-        performance = perform(files.puppet, files.score, carrier, view, robot=files.robot, arm=arm, seconds=seconds)
+        try:
+            performance = perform(files.puppet, files.score, carrier, view, robot=files.robot, arm=arm, seconds=seconds)
+        except LinkError as error:
+            raise LinkError(f"{where}: {error}") from error
     status = performance.status
     how = "stopped by hand" if performance.is_interrupted else "played"
     late = f", {status['late_frames']} late, at most {status['late_max_us']} us" if status else ""

@@ -43,10 +43,13 @@ def pulses(edges: Sequence[tuple[int, int]]) -> list[Pulse]:
 
 
 def measure(mcu: VirtualMcu, robot: Robot) -> list[PulseSummary]:
-    """Return what the pins of a robot have done since power on; outputs that gave no pulse are left out."""
+    """Return what the pins of a robot have done until they were killed; outputs that gave no pulse are left out.
+
+    The last pulse of a pin does not count: the kill has driven the pin low, perhaps in the middle of it.
+    """
     summaries = []
     for output in robot.outputs.values():
-        widths_us = [pulse.width_ns / 1000 for pulse in pulses(mcu.edges(output.pin))]
+        widths_us = [pulse.width_ns / 1000 for pulse in pulses(mcu.edges(output.pin))[:-1]]
         if widths_us:
             least_us, greatest_us = min(widths_us), max(widths_us)
             summaries.append(PulseSummary(output.dof, output.pin, len(widths_us), widths_us[-1], least_us, greatest_us))

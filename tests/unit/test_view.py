@@ -1,0 +1,91 @@
+"""The terminal's picture, and the lines where there is no terminal."""
+
+import io
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from marotte.puppet_file import load_puppet
+from marotte.view import Scene, View, bar_text, centred_text
+from marotte.wiring import load_robot
+
+PUPPETS = Path(__file__).parents[2] / "puppets"
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(0, "    "), (1, "████"), (0.5, "██  "), (0.125, "▌   "), (0.53125, "██▏ "), (-1, "    "), (2, "████")],
+)
+def test_bar_fills_to_an_eighth(share, text):
+    assert bar_text(share, 4) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0, "········"), (1, "····████"), (-1, "████····"), (-0.5, "··██····"), (0.25, "····█···"), (-9, "████····")],
+)
+def test_centred_bar_grows_from_the_middle(value, text):
+    assert centred_text(value, 8) == text
+
+
+@given(value=st.floats(-2, 2), width=st.integers(1, 40))
+def test_bars_keep_their_width(value, width):
+    assert len(bar_text(value, width)) == width
+    assert len(centred_text(value, 2 * width)) == 2 * width
+
+
+def picture(view, scene):
+    console = Console(width=80, file=io.StringIO(), color_system=None)
+    console.print(view.picture(scene))
+    return console.file.getvalue()
+
+
+@pytest.fixture
+def view():
+    puppet = load_puppet(PUPPETS / "pet.toml")
+    return View(
+        puppet, load_robot(PUPPETS / "pet-robot.toml", puppet), "emulated rp2040", 20, Console(file=io.StringIO())
+    )
+
+
+def test_view_shows_dofs_weights_pulses_and_time(view):
+    scene = Scene(45, {"NECK": 0.25, "WHEEL_LEFT": -0.5}, {"HAPPY_FACE": 0.75}, "HAPPY, mood EVEN", late_frames=2)
+    text = picture(view, scene)
+    for expected in (
+        "pet  on  emulated rp2040",
+        "1.5 of 20.0 s",
+        "0.250",
+        "-0.500",
+        "GP8 1250.0 us",
+        "0.75",
+        "HAPPY, mood EVEN",
+    ):
+        assert expected in text
+    assert "2 late frames" in text
+    assert all(name in text for name in [*view.puppet.dofs, *view.puppet.actions])
+    assert max(map(len, text.splitlines())) <= 80
+    assert len(text.splitlines()) <= 24
+
+
+def test_view_shows_the_beginning_and_silence(view):
+    assert "no word from the MCU" in picture(view, Scene(is_silent=True))
+
+
+def test_view_without_a_terminal_prints_a_line_a_cue(view):
+    with view:
+        view.show(Scene(3))
+        view.cue(1.5, "HAPPY")
+    assert view.console.file.getvalue() == "   1.50 s  HAPPY\n"
+
+
+def test_view_in_a_terminal_draws_in_place():
+    puppet = load_puppet(PUPPETS / "pet.toml")
+    console = Console(file=io.StringIO(), force_terminal=True, width=80, height=30)
+    with View(puppet, None, "here", 20, console) as view:
+        view.show(Scene(30))
+        view.cue(1.0, "not printed")
+    assert "1.0 of 20.0 s" in console.file.getvalue().replace("\x1b[2m", "").replace("\x1b[0m", "")
+    assert "not printed" not in console.file.getvalue()
