@@ -6,7 +6,11 @@ from marotte.errors import MarotteError
 from marotte.mcu.base import VirtualMcu
 
 STEP_US = 1_000
-ENTER = b"\r\x03\x03\r\x01"
+INTERRUPT = b"\r\x03"
+INTERRUPT_US = 100_000
+"""What firmware may take to stop in good order; what is sent meanwhile may be lost."""
+
+ENTER = b"\r\x01"
 PROMPT = b"raw REPL; CTRL-B to exit\r\n>"
 END = b"\x04"
 
@@ -25,6 +29,9 @@ class RawRepl:
     def enter(self, timeout_us: int = 3_000_000) -> None:
         """Enter the raw REPL (again, for example after a reset)."""
         self._received = b""
+        self.mcu.send(INTERRUPT)
+        self.mcu.run_for(INTERRUPT_US)
+        self.mcu.receive()
         self.mcu.send(ENTER)
         self._until(PROMPT, timeout_us)
 
