@@ -322,7 +322,8 @@ class Table:
 
 def check_number(document: Document, path: KeyPath, value: object, low: float, high: float) -> bool:
     """Return whether a value is a number in `low`..`high`; if not, note the mistake."""
-    if is_number(value) and low <= value <= high:  # type: ignore[operator]
+    # A limit such as 0.05 means the decimal, not the binary fraction next to it.
+    if is_number(value) and Decimal(str(low)) <= value <= Decimal(str(high)):  # type: ignore[operator]
         return True
     document.mistake(path, f"found {found(value)}, expected a number in {low:g}..{high:g}")
     return False

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.padding import Padding
 from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
@@ -22,6 +23,8 @@ WEIGHT_WIDTH = 16
 WEIGHT_FULL = 1.0
 """The weight that fills its bar; a heavier one shows its number only."""
 REFRESH_HZ = 12
+ECHO_WIDTH = 3
+"""Columns left free at the right, where the terminal echoes ^C: a line that it breaks would move the picture."""
 
 _EIGHTHS = " ▏▎▍▌▋▊▉█"
 _FULL = "█"
@@ -79,8 +82,9 @@ class View:
 
     def picture(self, scene: Scene) -> RenderableType:
         """Return the whole picture of a scene."""
-        parts = [self._headline(scene), Rule(style="dim"), self._dofs(scene), Rule(style="dim")]
-        return Group(*parts, self._weights(scene), Rule(style="dim"), self._footer(scene))
+        parts: list[RenderableType] = [self._headline(scene), Rule(style="dim"), self._dofs(scene), Rule(style="dim")]
+        parts += [self._weights(scene), Rule(style="dim"), self._footer(scene)]
+        return Padding(Group(*parts), (0, ECHO_WIDTH, 0, 0))
 
     def _headline(self, scene: Scene) -> RenderableType:
         time_s = max(scene.frame, 0) / self.puppet.frame_rate_hz

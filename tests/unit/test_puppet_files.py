@@ -86,6 +86,23 @@ def test_puppet_defaults_are_those_of_the_documentation(tmp_path):
     assert (neck.kind, neck.rest, neck.limits, neck.signal, neck.character) == ("absolute", 0.5, (0, 1), True, None)
 
 
+@pytest.mark.parametrize(
+    ("old", "ends"),
+    [
+        ("frame_rate = 25", ["frame_rate = 10", "frame_rate = 60"]),
+        ("seed = 7", ["seed = 0", "seed = 4294967295"]),
+        ("tempo = 2", ["tempo = 0.05", "tempo = 8", "tempo = 8.0"]),
+        ("tau = 0.5", ["tau = 0.03", "tau = 10.0", "tau = [0.03, 10]"]),
+        ("tempo = 0.25", ["tempo = 0.25", "tempo = 4.00"]),
+        ("noise_spread = 0.5", ["noise_spread = 0", "noise_spread = 1.0"]),
+        ("NOD = 4", ["NOD = 0", "NOD = 4.0"]),
+    ],
+)
+def test_puppet_ranges_include_their_ends(tmp_path, old, ends):
+    for end in ends:
+        assert mistakes_of(tmp_path, GOOD.replace(old, end, 1)) == []
+
+
 def test_puppet_pet_is_complete():
     puppet = load_puppet(PET)
     expected = "EYEBROW EYELID UPPERLIP LOWERLIP HEAD_YAW HEAD_PITCH NECK WHEEL_LEFT WHEEL_RIGHT BACK"

@@ -28,7 +28,13 @@ class EmulatorProcess:
     def __init__(self, command: Sequence[str | Path]):
         self._errors = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115
         words = [str(word) for word in command]
-        self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors)
+        self._process = subprocess.Popen(
+            words,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            start_new_session=True,  # Ctrl-C is for us: we still have a puppet to stop
+        )
         assert self._process.stdin and self._process.stdout
         self._requests, self._answers = self._process.stdin, self._process.stdout
         self._turn = threading.Lock()

@@ -37,7 +37,7 @@ class Endpoint(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close the port and the connection."""
+        """Close the port and the connection; calling it twice does no harm."""
 
 
 class TcpEndpoint(Endpoint):
@@ -160,4 +160,6 @@ class PtyEndpoint(Endpoint):
             return len(data)
 
     def close(self) -> None:
-        os.close(self._master)
+        if self._master >= 0:
+            os.close(self._master)
+        self._master = -1

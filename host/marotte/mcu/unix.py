@@ -66,6 +66,7 @@ class UnixMcu(VirtualMcu):
                 pass_fds=(command_read, record_write),
                 cwd=folder or (self._folder.name if self._folder else None),
                 env={**os.environ, "MICROPYPATH": str(ROOT)},
+                start_new_session=True,  # Ctrl-C is for us: we still have a puppet to stop
             )
         except OSError as error:
             raise MarotteError(f"{self._binary}: cannot be started: {error.strerror}") from error
