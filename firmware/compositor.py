@@ -69,28 +69,41 @@ def blend(
     hold_q15: ptr16,
     base_q15: ptr16,
     weight_sum: ptr32,
+    shift: ptr8,
     upper: ptr32,
     lower: ptr32,
 ):
     """Write every DOF's convex sum to `base_q15`; where all weights are 0 the base stays.
 
-    `weight_sum`, `upper` and `lower` are scratch, one word a DOF. The weights are shifted right so that their sum over all
-    playing actions, and HOLD's 1, stays below 2^27: a faint weight keeps all its bits unless others are heavy. Bits: the numerator
-    is `upper * 2^12 + lower`, `upper` at most 2^27 / 2^12 * 2^15 = 2^30; a product of a weight's upper limb is at most 2^30,
-    of its lower one 2^27. The division takes 4 bits a step: its remainder stays below 2^27, shifted below 2^31.
+    `weight_sum`, `shift`, `upper` and `lower` are scratch, one entry a DOF. A DOF's weights are shifted right so that their sum stays
+    below 2^27: faint ones keep all their bits where no others are heavy. Bits: the numerator is `upper * 2^12 + lower`,
+    `upper` at most 2^27 / 2^12 * 2^15 = 2^30; a product of a weight's upper limb is at most 2^30, of its lower one 2^27. The
+    division takes 4 bits a step: its remainder stays below 2^27, shifted below 2^31.
     """
-    total_q20 = 0x100000
-    n = 0
-    while n < found:
-        total_q20 += (w_q28[int(playing[n])] >> 8) + 1
-        n += 1
-    shift = 0
-    while total_q20 >= 0x80000:
-        total_q20 = total_q20 >> 1
-        shift += 1
     d = 0
     while d < dofs:
-        w = hold_w_q28[d] >> shift
+        weight_sum[d] = (hold_w_q28[d] >> 8) + 1
+        d += 1
+    n = 0
+    while n < found:
+        i = int(playing[n])
+        w = (w_q28[i] >> 8) + 1
+        m = int(first_mapping[i])
+        end = m + int(mappings[i])
+        while m < end:
+            d = int(mapped_dof[m])
+            weight_sum[d] = weight_sum[d] + w
+            m += 1
+        n += 1
+    d = 0
+    while d < dofs:
+        total_q20 = weight_sum[d]
+        places = 0
+        while total_q20 >= 0x80000:
+            total_q20 = total_q20 >> 1
+            places += 1
+        shift[d] = places
+        w = hold_w_q28[d] >> places
         a = int(hold_q15[d])
         carried = (w & 0xFFF) * a
         weight_sum[d] = w
@@ -100,21 +113,18 @@ def blend(
     n = 0
     while n < found:
         i = int(playing[n])
-        w = w_q28[i] >> shift
-        if w:
-            w_high = w >> 12
-            w_low = w & 0xFFF
-            m = int(first_mapping[i])
-            end = m + int(mappings[i])
-            while m < end:
-                d = int(mapped_dof[m])
-                a = int(low_q15[m])
-                a = a + (((int(high_q15[m]) - a) * int(value_q15[m]) + 0x4000) >> 15)
-                carried = w_low * a + lower[d]
-                weight_sum[d] = weight_sum[d] + w
-                upper[d] = upper[d] + w_high * a + (carried >> 12)
-                lower[d] = carried & 0xFFF
-                m += 1
+        m = int(first_mapping[i])
+        end = m + int(mappings[i])
+        while m < end:
+            d = int(mapped_dof[m])
+            w = w_q28[i] >> int(shift[d])
+            a = int(low_q15[m])
+            a = a + (((int(high_q15[m]) - a) * int(value_q15[m]) + 0x4000) >> 15)
+            carried = (w & 0xFFF) * a + lower[d]
+            weight_sum[d] = weight_sum[d] + w
+            upper[d] = upper[d] + (w >> 12) * a + (carried >> 12)
+            lower[d] = carried & 0xFFF
+            m += 1
         n += 1
     d = 0
     while d < dofs:

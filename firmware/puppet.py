@@ -60,6 +60,7 @@ class Puppet:
         self._value_q15 = halves(MAPPINGS_MAX)
         self._wanted = bytearray(DOFS_MAX)
         self._weight_sum = words(DOFS_MAX)
+        self._shift = bytearray(DOFS_MAX)
         self._upper = words(DOFS_MAX)
         self._lower = words(DOFS_MAX)
 
@@ -128,7 +129,7 @@ class Puppet:
         compositor.blend(
             self.playing, found, self.w_q28, t.first_mapping, t.mapping_count, t.mapped_dof, t.low_q15, t.high_q15,
             self._value_q15, t.dofs, self._hold_w_q28, self._hold_q15, self.base_q15,
-            self._weight_sum, self._upper, self._lower,
+            self._weight_sum, self._shift, self._upper, self._lower,
         )
         self.found = found
     # fmt: on

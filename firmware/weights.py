@@ -32,10 +32,6 @@ def integrate(count: int, target_q28: ptr32, x_q28: ptr32, w_q28: ptr32, rise_q2
                 + ((high * a_high) << 2)
                 + ((((high * a_low) << 2) + low * a_high + ((low * a_low) >> 13) + 0x1000) >> 13)
             )
-            difference = g - x
-            if -1024 < difference and difference < 1024:
-                x = g
-            x_q28[i] = x
             difference = x - w
             high = difference >> 15
             low = difference & 0x7FFF
@@ -44,9 +40,12 @@ def integrate(count: int, target_q28: ptr32, x_q28: ptr32, w_q28: ptr32, rise_q2
                 + ((high * a_high) << 2)
                 + ((((high * a_low) << 2) + low * a_high + ((low * a_low) >> 13) + 0x1000) >> 13)
             )
-            if x == g:
+            difference = g - x
+            if -1024 < difference and difference < 1024:
+                x = g
                 difference = g - w
                 if -1024 < difference and difference < 1024:
                     w = g
+            x_q28[i] = x
             w_q28[i] = w
         i += 1
