@@ -125,10 +125,14 @@ def _apply(
 
 
 class Cues:
-    """The queue of stamped targets; `late[0]` counts targets that came after their frame and acted at once."""
+    """The queue of stamped targets; `late[0]` counts targets that came after their frame and acted at once.
+
+    `detail` explains the last refusal: the number of the bad field, or the free places.
+    """
 
     def __init__(self):
         self.count = 0
+        self.detail = 0
         self.late = array("i", (0,))
         self._frame = array("i", bytes(4 * QUEUE_MAX))
         self._kind = bytearray(QUEUE_MAX)
@@ -139,14 +143,14 @@ class Cues:
         """Forget all that wait."""
         self.count = 0
 
-    def put(self, kind, body, start, length, indices, ack):
+    def put(self, kind, body, start, length, indices):
         """Queue the targets of a payload (`length` bytes at `body[start]`: stamp, then items of index and value); return a status.
 
-        `indices` is the number of actions or live channels. `ack.detail` gets the number of the bad field, or the free places.
+        `indices` is the number of actions or live channels.
         """
         items = (length - 4) // 5
         if self.count + items > QUEUE_MAX:
-            ack.detail = QUEUE_MAX - self.count
+            self.detail = QUEUE_MAX - self.count
             return messages.FULL
         if kind == TEMPO:
             first, indices = MASTER, 1
@@ -161,7 +165,7 @@ class Cues:
         )
         # fmt: on
         if bad >= 0:
-            ack.detail = bad
+            self.detail = bad
             return messages.RANGE
         self.count += items
         return messages.OK

@@ -85,13 +85,6 @@ def _pack_weights(body: ptr8, at: int, count: int, playing: ptr8, w_q28: ptr32) 
     return at
 
 
-class Ack:
-    """The answer to one command: what `messages` calls status and detail."""
-
-    def __init__(self):
-        self.detail = 0
-
-
 class Link:
     """Receives, answers and reports for one puppet. `silent` tells that no packet has come for the puppet's `link_timeout`."""
 
@@ -108,13 +101,13 @@ class Link:
         self._out = bytearray(codec.BODY_MAX)
         self._out_wire = bytearray(codec.WIRE_MAX)
         self._out_seq = 0
-        self._ack = Ack()
+        self._detail = 0  # of the answer under way
         self._expected = -1  # no session yet
         self._statuses = bytearray(_HISTORY)
         self._details = [0] * _HISTORY
         self._heard_us = self._byte_us = board.ticks_us()
         self._taps = self._taps_every = self._weights_every = 0
-        # By message id: place of its handler, least length, length of an item.
+        # By message id: length of the fields (-1: no such message), of an item, and what carries it out.
         self._fixed = [-1] * 128
         self._item = bytearray(128)
         self._formats = [None] * 128
@@ -179,9 +172,9 @@ class Link:
         if ahead == 0:
             status = self._carry_out(message_id, body, length - codec.OVERHEAD)
             self._statuses[seq % _HISTORY] = status
-            self._details[seq % _HISTORY] = self._ack.detail
+            self._details[seq % _HISTORY] = self._detail
             self._expected = (seq + 1) & 255
-            self._answer(seq, status, self._ack.detail)
+            self._answer(seq, status, self._detail)
             if message_id == messages.HELLO:
                 self._welcome()
             elif message_id == messages.STATUS_REQUEST:
@@ -193,15 +186,15 @@ class Link:
 
     def _carry_out(self, message_id, body, length):
         """Check the length of a command's payload and carry it out; return its status."""
-        self._ack.detail = message_id
+        self._detail = message_id
         fixed = self._fixed[message_id]
         if fixed < 0:
             return messages.UNKNOWN
         item = self._item[message_id]
         if length < fixed or (length != fixed if item == 0 else (length - fixed) % item != 0):
-            self._ack.detail = length
+            self._detail = length
             return messages.LENGTH
-        self._ack.detail = 0
+        self._detail = 0
         return self._handlers[message_id](body, length)
 
     # --- commands; each returns a status
@@ -243,7 +236,7 @@ class Link:
         for n in range((length - 2) // item):
             bad = staged.mapping(first + n, *unpack_from(_MAPPING_FORMAT, body, _PAYLOAD + 2 + n * item))
             if bad is not None:
-                self._ack.detail = 1 + 5 * n + bad
+                self._detail = 1 + 5 * n + bad
                 return messages.RANGE
         return messages.OK
 
@@ -257,8 +250,8 @@ class Link:
         status = self._staged()
         if status:
             return status
-        self._ack.detail = puppet.staged.missing()
-        if self._ack.detail:
+        self._detail = puppet.staged.missing()
+        if self._detail:
             return messages.INCOMPLETE
         puppet.commit()
         return messages.OK
@@ -308,11 +301,15 @@ class Link:
     def _judge(self, bad_field):
         if bad_field is None:
             return messages.OK
-        self._ack.detail = bad_field
+        self._detail = bad_field
         return messages.RANGE
 
     def _queue(self, kind, length, indices):
-        return self._puppet.cues.put(kind, self._wire, _PAYLOAD, length, indices, self._ack)
+        queue = self._puppet.cues
+        status = queue.put(kind, self._wire, _PAYLOAD, length, indices)
+        if status:
+            self._detail = queue.detail
+        return status
 
     # --- to the host
 
