@@ -75,27 +75,40 @@ export class Cpu {
     return this.cachedCycle;
   }
 
-  /** Let the chip live until `targetNanos`; the last instruction may end a little later. */
+  /** Let the chip live until `targetNanos`. An instruction that ends later has begun before; time itself stops exactly there. */
   runUntil(targetNanos) {
     const { clock, mcu } = this;
     this.targetNanos = targetNanos;
     while (!this.stopped) {
-      if (mcu.core.waiting) {
-        if (clock.nextNanos > targetNanos) break;
+      const readyNanos = mcu.core.waiting ? Infinity : this.grid.nanosAt(this.cycle);
+      if (clock.nextNanos <= Math.min(readyNanos, targetNanos)) {
         clock.advanceTo(clock.nextNanos);
-        if (!mcu.core.waiting) this.cycle = Math.max(this.cycle, this.grid.cycleAt(clock.nanos)) + this.takeStall();
+        if (readyNanos === Infinity && !mcu.core.waiting) this.wake();
+      } else if (readyNanos >= targetNanos) {
+        clock.advanceTo(targetNanos);
+        break;
       } else {
-        if (clock.nanos >= targetNanos && clock.nextNanos > clock.nanos) break;
-        this.core.run();
-        this.cycle += this.takeStall();
-        clock.advanceTo(this.grid.nanosAt(this.cycle));
-        if (this.newFrequencyHz !== null) {
-          this.grid.changeFrequency(this.cycle, this.newFrequencyHz);
-          this.newFrequencyHz = null;
-          this.cachedNanos = NaN;
-        }
+        this.execute();
       }
     }
-    if (mcu.core.waiting) clock.advanceTo(targetNanos);
+  }
+
+  /** An interrupt has ended the CPU's sleep: it goes on at its next clock cycle. */
+  wake() {
+    this.cycle = this.cycleNow + this.takeStall();
+  }
+
+  execute() {
+    this.core.run();
+    if (this.newFrequencyHz !== null) {
+      this.grid.changeFrequency(this.cycle, this.newFrequencyHz);
+      this.newFrequencyHz = null;
+      this.cachedNanos = NaN;
+    }
+  }
+
+  /** Clock cycles since the reset, whether the CPU slept or not. */
+  get cycleNow() {
+    return Math.max(this.cycle, this.grid.cycleAt(this.clock.nanos));
   }
 }

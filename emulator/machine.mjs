@@ -44,7 +44,7 @@ export class Machine {
 
   reset() {
     const start = Math.ceil(this.now);
-    this.cyclesBefore += this.chip.cpu.cycle;
+    this.cyclesBefore += this.chip.cpu.cycleNow;
     this.resets++;
     this.chipStart = start;
     this.powerOn();
@@ -98,7 +98,7 @@ export class Machine {
     const { cpu, mcu } = this.chip;
     return {
       instructions: this.core.instructions,
-      cycles: this.cyclesBefore + cpu.cycle,
+      cycles: this.cyclesBefore + cpu.cycleNow,
       clk_hz: Math.round(mcu.clkSys),
       resets: this.resets,
       flash_erases: this.flash.erases,

@@ -43,9 +43,11 @@ function fail(error) {
   process.stdout.write(`${JSON.stringify({ error: text })}\n`, () => process.exit(1));
 }
 
+process.on('SIGINT', () => {}); // Ctrl-C is for the host, which ends this process by closing its input
+
 try {
   const machine = buildMachine(readOptions());
-  process.stdout.write('{"ready": true}\n');
+  process.stdout.write('{"id": 0}\n'); // ready
   createInterface({ input: process.stdin }).on('line', (line) => {
     try {
       process.stdout.write(`${answer(machine, line)}\n`);

@@ -1,5 +1,7 @@
 // What the host says to the machine: one JSON object a line on standard input, one line of answer each on standard output.
 //
+// Requests and answers carry an "id", so that one who has been interrupted knows which answer is old.
+//
 //   {"op": "run", "until": NS, "send": [[NS, LINK, BASE64], ...]}  ->  {"out": [[NS, LINK, BASE64], ...], "next": NS or null}
 //   {"op": "edges", "pin": N}                ->  {"edges": [NS, LEVEL, NS, LEVEL, ...]}
 //   {"op": "clear_edges"}                    ->  {}
@@ -51,7 +53,7 @@ const OPERATIONS = {
       xpsr: core.xPSR >>> 0,
       primask: core.PM ? 1 : 0,
       ram_sha256: createHash('sha256').update(sram).digest('hex'),
-      cycles: machine.chip.cpu.cycle,
+      cycles: machine.chip.cpu.cycleNow,
       instructions: machine.core.instructions,
     };
   },
@@ -65,5 +67,5 @@ const OPERATIONS = {
 /** Carry out one request, a line of JSON, and return the line of its answer. */
 export function answer(machine, line) {
   const request = JSON.parse(line);
-  return JSON.stringify(OPERATIONS[request.op](machine, request));
+  return JSON.stringify({ id: request.id, ...OPERATIONS[request.op](machine, request) });
 }

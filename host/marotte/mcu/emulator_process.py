@@ -38,6 +38,7 @@ class EmulatorProcess:
         assert self._process.stdin and self._process.stdout
         self._requests, self._answers = self._process.stdin, self._process.stdout
         self._turn = threading.Lock()
+        self._last_id = 0
         self._read()
 
     @property
@@ -51,8 +52,9 @@ class EmulatorProcess:
     def ask(self, **request: object) -> dict:
         """Send one request and return its answer; threads take turns."""
         with self._turn:
+            self._last_id += 1
             try:
-                self._requests.write(json.dumps(request).encode() + b"\n")
+                self._requests.write(json.dumps({"id": self._last_id, **request}).encode() + b"\n")
                 self._requests.flush()
             except (OSError, ValueError):
                 raise self._failed("it has ended") from None
@@ -69,16 +71,19 @@ class EmulatorProcess:
             self._requests.close()
 
     def _read(self) -> dict:
-        ready, _, _ = select.select([self._answers], [], [], ANSWER_TIMEOUT_S)
-        if not ready:
-            raise self._failed(f"it has not answered for {ANSWER_TIMEOUT_S:.0f} s")
-        line = self._answers.readline()
-        if not line.endswith(b"\n"):
-            raise self._failed("it has ended")
-        answer = json.loads(line)
-        if "error" in answer:
-            raise self._failed(answer["error"])
-        return answer
+        """Return the answer to the last request, passing over those that nobody waited for after a Ctrl-C."""
+        while True:
+            ready, _, _ = select.select([self._answers], [], [], ANSWER_TIMEOUT_S)
+            if not ready:
+                raise self._failed(f"it has not answered for {ANSWER_TIMEOUT_S:.0f} s")
+            line = self._answers.readline()
+            if not line.endswith(b"\n"):
+                raise self._failed("it has ended")
+            answer = json.loads(line)
+            if "error" in answer:
+                raise self._failed(answer["error"])
+            if answer.pop("id") == self._last_id:
+                return answer
 
     def _failed(self, what: str) -> MarotteError:
         tail = []
