@@ -32,7 +32,7 @@ from marotte.ports import PortError, SerialCarrier, available
 from marotte.puppet import Puppet
 from marotte.puppet_file import load_puppet
 from marotte.rendering import RenderError, Rendering, render
-from marotte.score import Score, load_score
+from marotte.score import Cue, Score, load_score
 from marotte.session import Session
 from marotte.tables import Tables, build_tables, weight_q28
 from marotte.tomlfile import FileMistakes, Mistake
@@ -41,6 +41,7 @@ from shared.formats import FRAME_NOW
 
 __all__ = [
     "FRAME_NOW",
+    "Cue",
     "FileMistakes",
     "LinkError",
     "MarotteError",
