@@ -1,4 +1,4 @@
-"""Prints what the codec makes of bodies of every length, a line each. Runs on MicroPython and CPython, which must print the same."""
+"""Prints what the codec makes of bodies of every length, a line each; MicroPython and CPython must print the same."""
 
 from shared import codec
 
@@ -15,11 +15,6 @@ def bodies():
         yield body
 
 
-def text_of(data):
-    """Return bytes as hexadecimal digits."""
-    return "".join("%02x" % byte for byte in data)
-
-
 def answers():
     """Yield a line for each body: sealed, coded, decoded again, decoded with a byte changed."""
     for body in bodies():
@@ -28,15 +23,15 @@ def answers():
         length = codec.seal(sealed, len(body))
         wire = bytearray(codec.WIRE_MAX)
         wire_length = codec.encode(sealed, length, wire)
-        parts = [text_of(sealed[:length]), text_of(wire[:wire_length])]
+        parts = [sealed[:length].hex(), wire[:wire_length].hex()]
         back = bytearray(wire[: wire_length - 1])
         again = codec.decode(back, len(back))
-        parts.append("%d %s %s" % (again, text_of(back), codec.is_sealed(back, again)))
+        parts += [str(again), back.hex(), str(codec.is_sealed(back, again))]
         for place in (0, len(body) // 2):
             changed = bytearray(wire[: wire_length - 1])
             changed[place] = changed[place] ^ (1 << len(body) % 8)
             again = codec.decode(changed, len(changed))
-            parts.append("%d %s %s" % (again, text_of(changed), again >= 0 and codec.is_sealed(changed, again)))
+            parts += [str(again), changed.hex(), str(again >= 0 and codec.is_sealed(changed, again))]
         yield " ".join(parts)
 
 
