@@ -1,0 +1,50 @@
+"""Puppets and scores as dicts, loaded and played on an emulated MCU, with the taps as arrays."""
+
+import random
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy
+
+import marotte
+from tests.generate import random_puppet, random_score, to_toml
+
+TAPS = ("base", "signal", "motor")
+
+
+class Case(NamedTuple):
+    """A puppet, a score and, where pins are looked at, a robot, as `tomllib` gives them."""
+
+    name: str
+    puppet: dict
+    score: dict
+    robot: dict = {}
+
+
+def random_case(seed, seconds, **options):
+    """Return the random case of the `"core"` level that a seed stands for; `options` are those of `random_puppet`."""
+    rng = random.Random(seed)
+    puppet = random_puppet(rng, **options)
+    return Case(f"seed {seed}", puppet, random_score(rng, puppet, seconds))
+
+
+def load(case):
+    """Return the case's puppet, score and robot, read by the host from TOML files."""
+    with tempfile.TemporaryDirectory(prefix="marotte-test-") as folder:
+        paths = [Path(folder) / name for name in ("puppet.toml", "score.toml", "robot.toml")]
+        for path, document in zip(paths, (case.puppet, case.score, case.robot), strict=True):
+            path.write_text(to_toml(document), "utf-8")
+        puppet = marotte.load_puppet(paths[0])
+        return puppet, marotte.load_score(paths[1], puppet), marotte.load_robot(paths[2], puppet)
+
+
+def play(case, seconds, mcu="unix"):
+    """Return the rendering of a case: `mcu` and the result are those of `marotte.render`."""
+    puppet, score, robot = load(case)
+    return marotte.render(puppet, score, seconds, mcu, robot=robot)
+
+
+def tap(rendering, name):
+    """Return a tap of a rendering, an array [frames, dofs]."""
+    return numpy.array(list(getattr(rendering, name).values())).T
