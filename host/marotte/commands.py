@@ -93,7 +93,7 @@ def run_on_mcu(files: Files, mcu: str, arm: bool, seconds: Fraction | None, no_v
     with open_mcu(mcu) as virtual, serve(virtual) as live:
         carrier = SerialCarrier(live.url)
         try:
-            interrupted = _perform(files, carrier, f"emulated {mcu}", arm, seconds, no_view, console)
+            interrupted = _perform(files, carrier, f"emulated {mcu} at {live.url}", arm, seconds, no_view, console)
         finally:
             carrier.close()
         if files.robot and arm:

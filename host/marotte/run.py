@@ -64,7 +64,9 @@ def perform(
     last_frame = round(length_s * puppet.frame_rate_hz) - 1
     session = Session(carrier)
     session.open()
+    begin_us = carrier.now_us()
     session.upload(build_tables(puppet, robot))
+    view.note(f"{puppet.name} uploaded in {(carrier.now_us() - begin_us) / 1000:.0f} ms, on {view.where}")
     session.telemetry(formats.TAP_MOTOR, _every(puppet, REFRESH_HZ), _every(puppet, WEIGHTS_HZ))
     play = _Play(puppet, score, session, view)
     performance = Performance()

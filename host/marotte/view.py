@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from rich.console import Console, Group, RenderableType
+from rich.constrain import Constrain
 from rich.live import Live
-from rich.padding import Padding
 from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
@@ -75,6 +75,10 @@ class View:
         if self._live:
             self._live.update(self.picture(scene))
 
+    def note(self, text: str) -> None:
+        """Say something that happens once."""
+        self.console.print(Text(text), soft_wrap=True)
+
     def cue(self, at_s: float, text: str) -> None:
         """Say that a cue acts now."""
         if not self._live:
@@ -84,7 +88,7 @@ class View:
         """Return the whole picture of a scene."""
         parts: list[RenderableType] = [self._headline(scene), Rule(style="dim"), self._dofs(scene), Rule(style="dim")]
         parts += [self._weights(scene), Rule(style="dim"), self._footer(scene)]
-        return Padding(Group(*parts), (0, ECHO_WIDTH, 0, 0))
+        return Constrain(Group(*parts), self.console.width - ECHO_WIDTH)
 
     def _headline(self, scene: Scene) -> RenderableType:
         time_s = max(scene.frame, 0) / self.puppet.frame_rate_hz

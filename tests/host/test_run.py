@@ -34,6 +34,9 @@ class Watch(View):
         self.frames = []
         self.last = Scene()
 
+    def note(self, text):
+        self.notes = text
+
     def show(self, scene):
         self.frames.append(scene.frame)
         self.last = Scene(scene.frame, dict(scene.values), dict(scene.weights), scene.cue)
@@ -69,6 +72,7 @@ def test_run_plays_tells_and_stops(pet, mcu):
     performance = perform(puppet, score, VirtualCarrier(mcu), watch, robot=robot, arm=True, seconds=Fraction(4))
     assert not performance.is_interrupted
     assert 120 <= performance.frames <= 125
+    assert re.fullmatch(r"pet uploaded in \d+ ms, on here", watch.notes)
     assert [text for _, text in watch.told] == [
         "TIRED, mood WEARY",
         "CALM, mood EVEN",
@@ -142,6 +146,7 @@ def test_run_again_on_a_puppet_that_is_still_moving(pet, mcu):
 def test_run_command_ends_with_its_outputs_off(number):
     command = [sys.executable, "-u", "-m", "marotte", "run", *PET, *ROBOT, "--mcu", "unix", "--no-view"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert re.match(r"pet uploaded in \d+ ms, on emulated unix at /dev/\S+\n", process.stdout.readline())
         assert process.stdout.readline() == "   0.00 s  TIRED, mood WEARY\n"
         assert process.stdout.readline().endswith("CALM, mood EVEN\n")
         os.kill(process.pid, number)
