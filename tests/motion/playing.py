@@ -19,7 +19,7 @@ class Case(NamedTuple):
     name: str
     puppet: dict
     score: dict
-    robot: dict = {}
+    robot: dict | None = None
 
 
 def random_case(seed, seconds, **options):
@@ -33,7 +33,7 @@ def load(case):
     """Return the case's puppet, score and robot, read by the host from TOML files."""
     with tempfile.TemporaryDirectory(prefix="marotte-test-") as folder:
         paths = [Path(folder) / name for name in ("puppet.toml", "score.toml", "robot.toml")]
-        for path, document in zip(paths, (case.puppet, case.score, case.robot), strict=True):
+        for path, document in zip(paths, (case.puppet, case.score, case.robot or {}), strict=True):
             path.write_text(to_toml(document), "utf-8")
         puppet = marotte.load_puppet(paths[0])
         return puppet, marotte.load_score(paths[1], puppet), marotte.load_robot(paths[2], puppet)

@@ -1,7 +1,7 @@
 """The base tap against the float64 reference: the bounds of `docs/motion.md`, over random puppets and all corners.
 
-`make test` plays some dozens of puppets, `make soak` some hundreds. A random draw in which the reference itself stands at the edge of a
-decision (a weight within 2^-24 of the 1/256 that it is compared with) says nothing and is passed over.
+`make test` plays some dozens of puppets, `make soak` some hundreds. A random draw in which the reference itself stands at
+the edge of a decision (a weight within 2^-24 of the 1/256 that it is compared with) says nothing and is passed over.
 """
 
 import math
@@ -18,14 +18,11 @@ from marotte.mcu.unix import UnixMcu
 from marotte.prompter import Prompter
 from tests.corners import SECONDS as CORNER_SECONDS
 from tests.corners import corners
+from tests.motion.bounds import fractions_of_bound
 from tests.motion.playing import Case, load, play, random_case, tap
 from tests.reference import ReferencePuppet
 
 PUPPETS = Path(__file__).parents[2] / "puppets"
-STRONG, WEAK = 1 / 2048, 1 / 128
-STRONG_SUM = 1 / 64
-"""A DOF's sum of weights, HOLD included, from which the strong bound holds."""
-
 QUICK_SEEDS, QUICK_SECONDS = range(30), 10
 SOAK_SEEDS, SOAK_SECONDS = range(1000, 1400), 40
 SETTLING_TAUS = 18
@@ -40,13 +37,6 @@ def reference_base(case, frames):
         base[n] = reference.step()
         weight_sums[n] = reference.weight_sums
     return (base, weight_sums) if reference.is_decided() else None
-
-
-def fractions_of_bound(base, expected, weight_sums):
-    """Return the greatest error as a fraction of its bound, where the strong one holds and elsewhere (0 if nowhere)."""
-    errors = numpy.abs(base - expected)
-    is_strong = weight_sums >= STRONG_SUM
-    return (errors[is_strong] / STRONG).max(initial=0), (errors[~is_strong] / WEAK).max(initial=0)
 
 
 def assert_case_is_right(case, seconds):
