@@ -1,8 +1,8 @@
 """Actions: which of them play, and their phases.
 
-An action's nominal phase is `N = r * P`, its tempo times the master phase. It is computed afresh from the exact master phase in every
-frame, so nothing adds up and an action that sleeps costs nothing. The phase is kept as whole cycles modulo 4096 and a
-fraction in Q24.
+An action's nominal phase is `N = r * P`, its tempo times the master phase. It is computed afresh from the exact master
+phase in every frame, so nothing adds up and an action that sleeps costs nothing. The phase is kept as whole cycles
+modulo 4096 and a fraction in Q24.
 """
 
 import micropython
@@ -27,9 +27,10 @@ def phases(
 ):
     """Write the nominal phase of every playing action: `cycle[i]` in 0..4095, `fraction_q24[i]` in 0..2^24 - 1.
 
-    With `P = whole + (sixteenth + remainder / F) / 2^16` and the tempo `k / 2^16`, `k` at most 2^19:
-    `N = k * whole / 2^16 + (k * sixteenth + k * remainder / F) / 2^32`. `k` is split in two limbs of 10 bits, `whole` in two
-    of 14, which keeps every product below 2^26 and every sum below 2^30. The result is below the exact phase by less than 2^-24 cycle.
+    With `P = whole + (sixteenth + remainder / F) / 2^16` and the tempo `k / 2^16`, `k` at most 2^19: `N = k * whole /
+    2^16 + (k * sixteenth + k * remainder / F) / 2^32`. `k` is split in two limbs of 10 bits, `whole` in two of 14,
+    which keeps every product below 2^26 and every sum below 2^30. The result is below the exact phase by less than
+    2^-24 cycle.
     """
     whole_high = master[0] >> 14
     whole_low = master[0] & 0x3FFF

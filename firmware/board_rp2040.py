@@ -1,8 +1,8 @@
 """The board: a Raspberry Pi Pico. The only file that imports `machine`.
 
-The link is USB-CDC, which is the board's standard input and output, and UART0 on GP0 (TX) and GP1 (RX) at 115200 baud, both at once; answers go
-to where the last bytes came from. Servo pulses come from the PWM slices: 125 MHz / 40 gives counts of 0.32 us, 62500 of them a period of exactly
-20 ms. Nothing here allocates after start-up.
+The link is USB-CDC, which is the board's standard input and output, and UART0 on GP0 (TX) and GP1 (RX) at 115200 baud,
+both at once; answers go to where the last bytes came from. Servo pulses come from the PWM slices: 125 MHz / 40 gives
+counts of 0.32 us, 62500 of them a period of exactly 20 ms. Nothing here allocates after start-up.
 """
 
 import gc
@@ -69,7 +69,8 @@ class Board:
         micropython.kbd_intr(-1)
         self._stdin = sys.stdin.buffer
         self._stdout = sys.stdout.buffer
-        self._uart = machine.UART(0, _UART_BAUD, tx=machine.Pin(0), rx=machine.Pin(1, pull=machine.Pin.PULL_UP), rxbuf=1024, txbuf=1024)
+        rx = machine.Pin(1, pull=machine.Pin.PULL_UP)
+        self._uart = machine.UART(0, _UART_BAUD, tx=machine.Pin(0), rx=rx, rxbuf=1024, txbuf=1024)
         self._to_uart = False
         self._usb_poll = select.poll()
         self._usb_poll.register(sys.stdin, select.POLLIN)
@@ -114,7 +115,7 @@ class Board:
     def send(self, buffer, length):
         """Send the first `length` bytes of `buffer` to where the last bytes came from."""
         if self._to_uart:
-            self._uart.write(buffer, length)
+            self._uart.write(buffer, length)  # type: ignore[call-arg]  # the stub lacks the length
         else:
             self._stdout.write(buffer, length)
 
@@ -139,7 +140,7 @@ class Board:
         self._attached[pin] = 1
 
     def pulses(self, count, pin, pulse_q4us):
-        """Set the pulse widths of `count` DOFs: `pulse_q4us[d]` on `pin[d]` where that is attached, from the next period on."""
+        """Set the pulse widths from the next period on: `pulse_q4us[d]` on `pin[d]` where that is attached."""
         _pulses(count, pin, self._attached, pulse_q4us)
 
     def quiet(self):

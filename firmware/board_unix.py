@@ -1,12 +1,12 @@
 """The board on a PC: MicroPython's unix port in virtual time, for tests, renderings and trying things out.
 
-Virtual time advances only when the host says so. Each of the host's commands is a stretch of time together with the bytes
-that arrive in it; the board runs through it, skipping all waiting, tells what it sent and did, and stops at its end. Computing takes
-no time. All offsets count from the beginning of the stretch.
+Virtual time advances only when the host says so. Each of the host's commands is a stretch of time together with the
+bytes that arrive in it; the board runs through it, skipping all waiting, tells what it sent and did, and stops at its
+end. Computing takes no time. All offsets count from the beginning of the stretch.
 
-Commands (file 1, little-endian):  length_us u32 (at most 2^29), size u32, then `size` bytes: offset_us u32, count u16, bytes, repeated.
-Records (file 2): kind u8, offset_us u32, count u16, bytes. `S` bytes sent, `P` pulses (pin u8, pulse_q4us u16, repeated),
-`Q` all pins quiet, `D` the stretch is done.
+Commands (file 1, little-endian):  length_us u32 (at most 2^29), size u32, then `size` bytes: offset_us u32, count u16,
+bytes, repeated. Records (file 2): kind u8, offset_us u32, count u16, bytes. `S` bytes sent, `P` pulses (pin u8,
+pulse_q4us u16, repeated), `Q` all pins quiet, `D` the stretch is done.
 """
 
 import gc

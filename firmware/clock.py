@@ -1,8 +1,8 @@
 """Time: when the next frame is due, and the master phase.
 
-Frame `n` stands for the instant `n / F` exactly. The frame clock counts in the microseconds of the board's timer and carries
-the remainder of `1000000 / F` over, so frame `n` is due within one tick of `n / F` however long it runs. The master
-phase `P` is an exact rational: `P(n+1) = P(n) + T(n) / F` with the tempo `T` a multiple of 1/65536.
+Frame `n` stands for the instant `n / F` exactly. The frame clock counts in the microseconds of the board's timer and
+carries the remainder of `1000000 / F` over, so frame `n` is due within one tick of `n / F` however long it runs. The
+master phase `P` is an exact rational: `P(n+1) = P(n) + T(n) / F` with the tempo `T` a multiple of 1/65536.
 
 Board ticks are taken modulo 2^30, so every value here is a small integer and nothing allocates.
 """
@@ -32,7 +32,8 @@ def ticks_diff(later, earlier):
 class FrameClock:
     """Tells when frames are due; measures how late they were begun.
 
-    `rate_hz` is the frame rate, 10..60. `late_max_us` and `late_frames` (begun a whole frame late or more) count since `start`.
+    `rate_hz` is the frame rate, 10..60. `late_max_us` and `late_frames` (begun a whole frame late or more) count since
+    `start`.
     """
 
     def __init__(self):

@@ -1,8 +1,8 @@
 """The motion compositor: masks, the convex sum, and HOLD.
 
-`value_j = sum(mask_ij * w_i * a_ij) / sum(mask_ij * w_i)` over the playing actions `i` and one more, HOLD, that every DOF
-has: a constant value that takes the DOF over, through the same filters as every weight, while no action asks for it.
-The mask is the list of mappings itself: an action sums into the DOFs it maps and touches no other.
+`value_j = sum(mask_ij * w_i * a_ij) / sum(mask_ij * w_i)` over the playing actions `i` and one more, HOLD, that every
+DOF has: a constant value that takes the DOF over, through the same filters as every weight, while no action asks for
+it. The mask is the list of mappings itself: an action sums into the DOFs it maps and touches no other.
 """
 
 import micropython
@@ -25,8 +25,8 @@ def hold_targets(
 ):
     """Set HOLD's target of every DOF: 1 while no action that maps it has a target above 0, else 0.
 
-    Where the target becomes 1 on an absolute DOF while HOLD's own weight is below 1/256, its value becomes the DOF's base of
-    the frame before. `wanted` is scratch, one byte a DOF.
+    Where the target becomes 1 on an absolute DOF while HOLD's own weight is below 1/256, its value becomes the DOF's
+    base of the frame before. `wanted` is scratch, one byte a DOF.
     """
     d = 0
     while d < dofs:
@@ -75,10 +75,10 @@ def blend(
 ):
     """Write every DOF's convex sum to `base_q15`; where all weights are 0 the base stays.
 
-    `weight_sum`, `shift`, `upper` and `lower` are scratch, one entry a DOF. A DOF's weights are shifted right so that their sum stays
-    below 2^27: faint ones keep all their bits where no others are heavy. Bits: the numerator is `upper * 2^12 + lower`,
-    `upper` at most 2^27 / 2^12 * 2^15 = 2^30; a product of a weight's upper limb is at most 2^30, of its lower one 2^27. The
-    division takes 4 bits a step: its remainder stays below 2^27, shifted below 2^31.
+    `weight_sum`, `shift`, `upper` and `lower` are scratch, one entry a DOF. A DOF's weights are shifted right so that
+    their sum stays below 2^27: faint ones keep all their bits where no others are heavy. Bits: the numerator is `upper
+    * 2^12 + lower`, `upper` at most 2^27 / 2^12 * 2^15 = 2^30; a product of a weight's upper limb is at most 2^30, of
+    its lower one 2^27. The division takes 4 bits a step: its remainder stays below 2^27, shifted below 2^31.
     """
     d = 0
     while d < dofs:

@@ -1,7 +1,7 @@
 """Stamped targets: what the host sends waits here for the frame in which it acts.
 
-A target is a weight target, a live channel's target or a tempo. Targets of one frame act in the order of their arrival. All storage
-is preallocated; what does not fit is refused whole, and the host sends it again.
+A target is a weight target, a live channel's target or a tempo. Targets of one frame act in the order of their arrival.
+All storage is preallocated; what does not fit is refused whole, and the host sends it again.
 """
 
 from array import array
@@ -41,11 +41,11 @@ def _put(
     queue_value: ptr32,
     count: int,
 ) -> int:
-    """Append `items` targets of 5 bytes (index, value as 32 bits) behind a frame stamp; return -1, or the place of a bad one.
+    """Append `items` targets of 5 bytes (index, value as 32 bits); return -1, or the place of a bad field.
 
-    Nothing is stored unless all indices lie in first_index .. first_index + indices - 1 and all values in least..most. The payload begins
-    at `start` with the stamp, -1 for now. Values are below 2^31 once the top byte has been looked at. A bad stamp is place 0, then every
-    item has two places, as in the acknowledgement's detail.
+    Nothing is stored unless all indices lie in first_index .. first_index + indices - 1 and all values in least..most.
+    The payload begins at `start` with the stamp, -1 for now. Values are below 2^31 once the top byte has been looked
+    at. A bad stamp is place 0, then every item has two places, as in the acknowledgement's detail.
     """
     if int(body[start + 3]) & 128:
         if (int(body[start]) & int(body[start + 1]) & int(body[start + 2]) & int(body[start + 3])) != 255:
@@ -97,7 +97,7 @@ def _apply(
     tempo_q16: ptr32,
     late: ptr32,
 ) -> int:
-    """Let all targets stamped `frame` or earlier act, close the gaps; return how many wait. `late[0]` counts the late ones."""
+    """Let all targets stamped `frame` or earlier act; return how many wait. `late[0]` counts the late ones."""
     kept = 0
     n = 0
     while n < count:
@@ -144,8 +144,9 @@ class Cues:
         self.count = 0
 
     def put(self, kind, body, start, length, indices):
-        """Queue the targets of a payload (`length` bytes at `body[start]`: stamp, then items of index and value); return a status.
+        """Queue the targets of a payload, or none of them; return a status.
 
+        The payload has `length` bytes at `body[start]`: the stamp, then items of index and value.
         `indices` is the number of actions or live channels.
         """
         items = (length - 4) // 5

@@ -19,7 +19,8 @@ _STEP_SIN_Q40 = 13492699036
 def sine_table():
     """Return `(1 + sin(2 pi i / 512)) / 2` in Q15 for i = 0..512, an array of 513 unsigned 16-bit words.
 
-    A quarter is turned step by step in Q40 integers, so every MCU gets the same table whatever its floats are; the rest is symmetry.
+    A quarter is turned step by step in Q40 integers, so every MCU gets the same table whatever its floats are; the rest
+    is symmetry.
     """
     table = array("H", bytes(2 * 513))
     cosine = 1 << 40
@@ -63,9 +64,9 @@ def _draw(gradients: ptr16, first: int, count: int, low: int, high: int, spread_
 def fill_gradients(gradients, seed, spread_q15):
     """Draw the gradients of all 16 noise tables of a puppet seed into an array of 16 * 256 unsigned 16-bit words.
 
-    A gradient -1 <= g < 1 is stored as `32768 * g + 32768`. Table `k` (1..16) starts from `(seed * 0x9E3779B1 + k * 0x85EBCA77) mod 2^32`, or 1
-    if that is 0. `spread_q15` (0..32768) raises small magnitudes: `|g|` becomes `spread + (1 - spread) * |g|`, 0 counting as positive.
-    Allocates large integers: not for the performance.
+    A gradient -1 <= g < 1 is stored as `32768 * g + 32768`. Table `k` (1..16) starts from `(seed * 0x9E3779B1 + k *
+    0x85EBCA77) mod 2^32`, or 1 if that is 0. `spread_q15` (0..32768) raises small magnitudes: `|g|` becomes `spread +
+    (1 - spread) * |g|`, 0 counting as positive. Allocates large integers: not for the performance.
     """
     for k in range(1, NOISE_TABLES + 1):
         state = (seed * 0x9E3779B1 + k * 0x85EBCA77) & 0xFFFFFFFF or 1
@@ -96,8 +97,8 @@ def evaluate(
 ):
     """Write the function value of every mapping of the playing actions to `value_q15`, Q15 in 0..32768.
 
-    Noise: with `j` whole and `u` the fraction, `h = u * (1-u) * (g[j] * (1-u) - g[j+1] * u)`, the value is `1/2 + 2 * h`.
-    Bits: `u` and `g` in Q15, so their products stay within 2^30, and as `(1-u) + u = 1` so does their difference.
+    Noise: with `j` whole and `u` the fraction, `h = u * (1-u) * (g[j] * (1-u) - g[j+1] * u)`, the value is `1/2 + 2 *
+    h`. Bits: `u` and `g` in Q15, so their products stay within 2^30, and as `(1-u) + u = 1` so does their difference.
     """
     n = 0
     while n < found:
@@ -119,9 +120,9 @@ def evaluate(
                 j = int(cycle[i])
                 u = (phase + 0x100) >> 9
                 v = 32768 - u
-                slope = (
-                    (int(gradients[k + (j & 255)]) - 32768) * v - (int(gradients[k + ((j + 1) & 255)]) - 32768) * u + 0x4000
-                ) >> 15
+                g = int(gradients[k + (j & 255)]) - 32768
+                g_next = int(gradients[k + ((j + 1) & 255)]) - 32768
+                slope = (g * v - g_next * u + 0x4000) >> 15
                 f = 16384 + ((((u * v + 0x2000) >> 14) * slope + 0x4000) >> 15)
             elif code == _CONST:
                 f = int(argument[m])

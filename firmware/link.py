@@ -1,10 +1,12 @@
 """The link's end on the MCU: packets in, acknowledgements and telemetry out.
 
-Commands carry sequence numbers and are carried out in their order, each exactly once. A packet that is damaged is as good as
-lost; one that comes after a gap is answered with the number that is expected, a repeated one with its first answer. `hello` begins a session with
-whatever number it has. Nothing here allocates while a puppet plays: tables are what `begin` .. `commit` bring, and those come first.
+Commands carry sequence numbers and are carried out in their order, each exactly once. A packet that is damaged is as
+good as lost; one that comes after a gap is answered with the number that is expected, a repeated one with its first
+answer. `hello` begins a session with whatever number it has. Nothing here allocates while a puppet plays: tables are
+what `begin` .. `commit` bring, and those come first.
 
-A reader of the wire must not trust it: kernels get only indices and lengths that were checked here, in `tables` or in `cues`.
+A reader of the wire must not trust it: kernels get only indices and lengths that were checked here, in `tables` or in
+`cues`.
 """
 
 from struct import pack_into, unpack_from
@@ -86,7 +88,10 @@ def _pack_weights(body: ptr8, at: int, count: int, playing: ptr8, w_q28: ptr32) 
 
 
 class Link:
-    """Receives, answers and reports for one puppet. `silent` tells that no packet has come for the puppet's `link_timeout`."""
+    """Receives, answers and reports for one puppet.
+
+    `silent` tells that no packet has come for the puppet's `link_timeout`; `packets` and `damaged` count what came.
+    """
 
     def __init__(self, board, puppet):
         self.silent = True
@@ -351,8 +356,8 @@ class Link:
         puppet = self._puppet
         # fmt: off
         pack_into(
-            _WELCOME_FORMAT, self._out, _PAYLOAD, messages.PROTOCOL, self._dictionary, DOFS_MAX, ACTIONS_MAX, MAPPINGS_MAX,
-            LIVES_MAX, QUEUE_MAX, puppet.frame, puppet.motor.armed,
+            _WELCOME_FORMAT, self._out, _PAYLOAD, messages.PROTOCOL, self._dictionary,
+            DOFS_MAX, ACTIONS_MAX, MAPPINGS_MAX, LIVES_MAX, QUEUE_MAX, puppet.frame, puppet.motor.armed,
         )
         # fmt: on
         self._send(messages.WELCOME, _WELCOME_END)
@@ -361,8 +366,8 @@ class Link:
         puppet = self._puppet
         # fmt: off
         pack_into(
-            _STATUS_FORMAT, self._out, _PAYLOAD, puppet.frame, puppet.motor.armed, self.silent, puppet.clock.late_max_us,
-            puppet.clock.late_frames, puppet.frame_max_us, self.packets, self.damaged, puppet.cues.late[0],
+            _STATUS_FORMAT, self._out, _PAYLOAD, puppet.frame, puppet.motor.armed, self.silent,
+            puppet.clock.late_max_us, puppet.clock.late_frames, puppet.frame_max_us, self.packets, self.damaged, puppet.cues.late[0],
             self._board.heap_free(),
         )
         # fmt: on

@@ -1,7 +1,7 @@
 """The firmware's main loop: frames when they are due, the link in between.
 
-`perform` runs until the host calls for the REPL (`\\r`, Ctrl-C at the start of a packet, as mpremote sends them), and leaves the board
-safe: no pulses, nothing moving.
+`perform` runs until the host calls for the REPL (`\\r`, Ctrl-C at the start of a packet, as mpremote sends them), and
+leaves the board safe: no pulses, nothing moving.
 """
 
 import gc

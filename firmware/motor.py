@@ -1,7 +1,7 @@
 """Motor control: the last layer before the board. Clamps, calibrates, and decides whether pulses flow.
 
-Absolute DOFs take positions, relative DOFs velocities with 16384 (Q15) standing still. Nothing is driven until `arm`; `kill` takes all
-pulses away at once. When the link falls silent, relative DOFs ease to a stand within 300 ms.
+Absolute DOFs take positions, relative DOFs velocities with 16384 (Q15) standing still. Nothing is driven until `arm`;
+`kill` takes all pulses away at once. When the link falls silent, relative DOFs ease to a stand within 300 ms.
 """
 
 import micropython
@@ -29,8 +29,8 @@ def _move(
 ):
     """Write the clamped value and the calibrated pulse width of every DOF.
 
-    `ease_q15` scales the speed of relative DOFs, 32768 being full. Bits: values are Q15 in 0..32768, pulse widths below 2^16, so products stay
-    within 2^31.
+    `ease_q15` scales the speed of relative DOFs, 32768 being full. Bits: values are Q15 in 0..32768, pulse widths below
+    2^16, so products stay within 2^31.
     """
     d = 0
     while d < dofs:
@@ -48,15 +48,18 @@ def _move(
 
 
 class Motor:
-    """The outputs of one puppet. `motor_q15` is what each DOF was last told, `pulse_q4us` its pulse width in 1/16 us."""
+    """The outputs of one puppet.
 
-    def __init__(self, board):
+    `motor_q15` is what each DOF was last told, `pulse_q4us` its pulse width in 1/16 us.
+    """
+
+    def __init__(self, board, tables):
         self.armed = False
         self.motor_q15 = halves(DOFS_MAX)
         self.pulse_q4us = halves(DOFS_MAX)
         self._board = board
         self._ease_q15 = VALUE_ONE
-        self._tables = None
+        self._tables = tables
 
     def load(self, tables):
         """Take over a puppet's limits and calibration; all outputs fall silent, every DOF is at rest."""
@@ -83,8 +86,6 @@ class Motor:
     def arm(self):
         """Let pulses flow, from the present values. Returns whether there is an output to arm."""
         tables = self._tables
-        if tables is None:
-            return False
         for d in range(tables.dofs):
             if tables.pin[d] != NO_PIN:
                 self._board.attach(tables.pin[d])

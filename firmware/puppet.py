@@ -1,7 +1,7 @@
 """The puppet: its tables, its state, and one frame through all layers.
 
-Data runs one way: targets, weights, actions, functions, compositor, motor, board. Each layer is a kernel over arrays that are made
-here once; a frame allocates nothing.
+Data runs one way: targets, weights, actions, functions, compositor, motor, board. Each layer is a kernel over arrays
+that are made here once; a frame allocates nothing.
 """
 
 from firmware import actions, clock, compositor, functions, weights
@@ -24,7 +24,8 @@ class Puppet:
     """One puppet on one board.
 
     `frame` is the number of the next frame, -1 while the motion does not run. `base_q15` and `signal_q15` hold the last
-    frame's values per DOF, after the compositor and after signal processing; `motor.motor_q15` what the motors were told.
+    frame's values per DOF, after the compositor and after signal processing; `motor.motor_q15` what the motors were
+    told.
     """
 
     def __init__(self, board):
@@ -32,9 +33,9 @@ class Puppet:
         self.frame_max_us = 0
         self.clock = clock.FrameClock()
         self.cues = Cues()
-        self.motor = Motor(board)
         self.tables = Tables()  # those that play
         self.staged = Tables()  # those that the host fills
+        self.motor = Motor(board, self.tables)
         self.tempo_q16 = words(1)
         self.live_target_q28 = words(LIVES_MAX)
         self.weight_target_q28 = words(ACTIONS_MAX)
@@ -92,7 +93,7 @@ class Puppet:
         self.cues.clear()
 
     def step(self, silent):
-        """Compute the frame that is due and bring it to the motors; `silent` tells that the link has been quiet too long."""
+        """Compute the frame that is due and bring it to the motors; `silent` tells that the link is quiet."""
         begun_us = self._board.ticks_us()
         self.clock.begin(begun_us)
         self._synthesise()
@@ -135,7 +136,7 @@ class Puppet:
     # fmt: on
 
     def _rest(self):
-        """Set all state to what holds before frame 0: no action, HOLD at rest, live channels at rest, tempo 1, phase 0."""
+        """Set the state before frame 0: no action, HOLD and live channels at rest, tempo 1, phase 0."""
         tables = self.tables
         self.frame = -1
         self.found = 0

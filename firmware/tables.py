@@ -1,7 +1,7 @@
 """A puppet's tables: plain integer arrays, filled over the link, checked before they are played.
 
-There are two sets, one that plays and one that is being filled; `commit` of a complete set exchanges them. Every index that a
-kernel will use is checked here, because viper checks nothing. All arrays have room for the largest puppet.
+There are two sets, one that plays and one that is being filled; `commit` of a complete set exchanges them. Every index
+that a kernel will use is checked here, because viper checks nothing. All arrays have room for the largest puppet.
 """
 
 from array import array
@@ -44,8 +44,11 @@ def halves(count):
 
 
 class Tables:
-    """One set of tables. The methods `begin`, `dof` .. `live` store one message's fields and return None, or the number of the field
-    that is out of range. Order: `begin`, then `dof` 0, 1, .., `action` 0, 1, .., `mappings`, `live`, each in its place exactly once.
+    """One set of tables.
+
+    The methods `begin`, `dof` .. `live` store one message's fields and return None, or the number of the field that is out
+    of range. Order: `begin`, then `dof` 0, 1, .., `action` 0, 1, .., `mappings`, `live`, each
+    in its place exactly once.
     """
 
     def __init__(self):

@@ -11,9 +11,9 @@ import micropython
 def integrate(count: int, target_q28: ptr32, x_q28: ptr32, w_q28: ptr32, rise_q26: ptr32, fall_q26: ptr32):
     """Move `x` and `w` of every entry one frame towards its target.
 
-    All arrays are Q28 in 0..4 (0..2^30), the coefficients `1 - exp(-1 / (F * tau))` in Q26 below 1. `rise` holds while the
-    target is above `x`. A value nearer than 2^-18 to where it goes arrives. Bits: a difference has 31 with its sign; times
-    26, in limbs of 16 + 15 and 13 + 13, no product passes 2^29 and no sum 2^31.
+    All arrays are Q28 in 0..4 (0..2^30), the coefficients `1 - exp(-1 / (F * tau))` in Q26 below 1. `rise` holds while
+    the target is above `x`. A value nearer than 2^-18 to where it goes arrives. Bits: a difference has 31 with its
+    sign; times 26, in limbs of 16 + 15 and 13 + 13, no product passes 2^29 and no sum 2^31.
     """
     i = 0
     while i < count:

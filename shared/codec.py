@@ -1,15 +1,15 @@
 """The packet codec: COBS framing, a CRC-32, and nothing else.
 
 A packet's body is `id, sequence number, payload, CRC-32` (little-endian, the checksum of Ethernet and zlib over all
-before it). On the wire the body is COBS-coded, so it has no zero in it, and one zero byte ends it. A reader that comes in late, or
-loses bytes, finds the next packet behind the next zero.
+before it). On the wire the body is COBS-coded, so it has no zero in it, and one zero byte ends it. A reader that comes
+in late, or loses bytes, finds the next packet behind the next zero.
 
 COBS puts the distance to the next zero first, then the id; as no id is 3, no packet begins with `0D 03`, which is what
 mpremote sends to reach the REPL.
 
-Sizes: a body has at most BODY_MAX bytes, on the wire at most WIRE_MAX with its zero. The functions work in buffers of the caller
-and allocate nothing. On the MCU they are viper kernels; every intermediate stays inside 17 bits, because the checksum
-is kept in two halves.
+Sizes: a body has at most BODY_MAX bytes, on the wire at most WIRE_MAX with its zero. The functions work in buffers of
+the caller and allocate nothing. On the MCU they are viper kernels; every intermediate stays inside 17 bits, because the
+checksum is kept in two halves.
 
 Source: Cheshire and Baker, Consistent Overhead Byte Stuffing, 1999; CRC-32 as in IEEE 802.3.
 """
@@ -19,7 +19,7 @@ from array import array
 try:
     import micropython
 except ImportError:
-    from shared import cpython as micropython
+    from shared import cpython as micropython  # type: ignore[no-redef]
     from shared.cpython import ptr8, ptr16
 
 BODY_MAX = 250
@@ -81,7 +81,7 @@ def seal(body, length):
 
 
 def is_sealed(body, length):
-    """Return whether the last four of `length` bytes are the checksum of those before, and a packet's least length is there."""
+    """Return whether `length` bytes are long enough for a packet and end with the checksum of those before."""
     if length < OVERHEAD:
         return False
     _checksum(body, length - 4, _CRC_LOW, _CRC_HIGH, _crc)
@@ -95,7 +95,7 @@ def is_sealed(body, length):
 
 @micropython.viper
 def encode(body: ptr8, length: int, wire: ptr8) -> int:
-    """COBS-code `length` bytes (at most 254) into `wire` and end them with a zero; return the number of bytes written."""
+    """COBS-code `length` bytes (at most 254) into `wire`, a zero behind them; return the number of bytes there."""
     code_at = 0
     code = 1
     out = 1
@@ -118,7 +118,7 @@ def encode(body: ptr8, length: int, wire: ptr8) -> int:
 
 @micropython.viper
 def decode(wire: ptr8, length: int) -> int:
-    """Decode `length` COBS bytes (without their zero) in place; return the length of the body, or -1 if they are not COBS.
+    """Decode `length` COBS bytes (without their zero) in place; return the body's length, -1 if they are not COBS.
 
     A code byte that points past the end makes them malformed. The body is never longer than what was there before.
     """

@@ -1,25 +1,24 @@
-"""What CPython lacks to run viper kernels as plain Python: the decorator and the pointer casts.
+"""What CPython lacks to run viper kernels as plain Python: the decorator, and the names of the pointer types.
 
-Imported by the shared kernels when there is no `micropython` module; never part of a firmware image.
-The casts give views whose items read as the hardware would read them; they check the bounds, which viper does not.
+Imported by the shared kernels when there is no `micropython` module; never part of a firmware image. The kernels are
+called with the same buffers on both sides, and here their items are read as Python reads them.
 """
+
+from typing import Protocol
+
+
+class ptr8(Protocol):
+    """A buffer of unsigned bytes."""
+
+    def __getitem__(self, index: int, /) -> int: ...
+
+    def __setitem__(self, index: int, value: int, /) -> None: ...
+
+
+class ptr16(ptr8, Protocol):
+    """A buffer of unsigned 16-bit words."""
 
 
 def viper(function):
     """Stand in for `micropython.viper`: the function runs as it is."""
     return function
-
-
-def ptr8(buffer):
-    """View a buffer as unsigned bytes."""
-    return memoryview(buffer).cast("B")
-
-
-def ptr16(buffer):
-    """View a buffer as unsigned 16-bit words."""
-    return memoryview(buffer).cast("B").cast("H")
-
-
-def ptr32(buffer):
-    """View a buffer as signed 32-bit words."""
-    return memoryview(buffer).cast("B").cast("i")

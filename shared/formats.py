@@ -43,7 +43,8 @@ PULSE_MIN_US = 300
 PULSE_MAX_US = 3000
 SERVO_PERIOD_US = 20000
 
-# Function codes of a mapping; `argument` is, in this order: nothing, nothing, the table 0..15, a value_q15, a live channel.
+# Function codes of a mapping. Its `argument` is, in this order: nothing, nothing, the table 0..15, a value_q15, a live
+# channel.
 FUNCTION_RSIN = 0
 FUNCTION_RCOS = 1
 FUNCTION_NOISE = 2

@@ -1,10 +1,11 @@
 """The host's end of the link: reliable commands over a byte stream that may lose or damage bytes.
 
-`Link` does the protocol and nothing else: it is handed a carrier for its bytes and its clock, so the same code works in real time over
-a serial port and in virtual time with an emulated MCU.
+`Link` does the protocol and nothing else: it is handed a carrier for its bytes and its clock, so the same code works in
+real time over a serial port and in virtual time with an emulated MCU.
 
-Commands are numbered and carried out by the MCU in their order, each once; up to WINDOW of them are under way. What is not
-acknowledged within RETRY_US is sent again, with all that follow it. Telemetry is not acknowledged: what is lost of it is lost.
+Commands are numbered and carried out by the MCU in their order, each once; up to WINDOW of them are under way. What is
+not acknowledged within RETRY_US is sent again, with all that follow it. Telemetry is not acknowledged: what is lost of
+it is lost.
 """
 
 from __future__ import annotations
@@ -114,7 +115,7 @@ class _Command:
 
 
 def pack(name: str, fields: dict[str, int], items: list[dict[str, int]] | None = None) -> bytes:
-    """Return a message's payload. Raises ValueError, with message and field, for a missing field or one out of its type's range."""
+    """Return a message's payload. Raises ValueError for a field that is missing or out of its type's range."""
     _, _, field_pairs, item_pairs = _BY_NAME[name]
     parts = [_pack_pairs(name, field_pairs, fields)]
     parts += [_pack_pairs(name, item_pairs, item) for item in items or []]
@@ -169,7 +170,10 @@ class Link:
         items: list[dict[str, int]] | None = None,
         on_refused: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Send a command, at once if the window allows. `on_refused(status, detail)` is called if the MCU refuses it; without, `pump` raises LinkRefused."""
+        """Send a command, at once if the window allows.
+
+        `on_refused(status, detail)` is called if the MCU refuses it; without, `pump` raises LinkRefused.
+        """
         packet = wire_packet(_BY_NAME[name][1], self._seq, pack(name, fields or {}, items))
         self._backlog.append(_Command(self._seq, name, packet, 0, on_refused))
         self._seq = (self._seq + 1) & 255

@@ -1,11 +1,11 @@
 """A session with one MCU: the greeting, a puppet's tables, and the performance.
 
-    session = Session(SerialCarrier("/dev/ttyACM0"))
-    session.open()
-    session.upload(build_tables(puppet, robot))
-    session.start()
-    session.weight_targets(FRAME_NOW, {0: weight_q28(1.0)})
-    session.pump(20_000)        # often: at least every 200 ms, or the MCU finds the link silent
+session = Session(SerialCarrier("/dev/ttyACM0"))
+session.open()
+session.upload(build_tables(puppet, robot))
+session.start()
+session.weight_targets(FRAME_NOW, {0: weight_q28(1.0)})
+session.pump(20_000)        # often: at least every 200 ms, or the MCU finds the link silent
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class LinkForeign(LinkError):
 class Session:
     """One host and one MCU. All methods raise LinkError, or what the carrier raises, when the MCU or the port is gone.
 
-    `welcome` holds the fields of the MCU's greeting. `taps` collects `(frame, taps, values_q15)` as telemetry brings them: the values of
-    all DOFs, base, signal and motor one after the other as far as `taps` names them. `weights` is `(frame, {action: weight_q12})` of the
-    last weights message.
+    `welcome` holds the fields of the MCU's greeting. `taps` collects `(frame, taps, values_q15)` as telemetry brings
+    them: the values of all DOFs, base, signal and motor one after the other as far as `taps` names them. `weights` is
+    `(frame, {action: weight_q12})` of the last weights message.
     """
 
     def __init__(self, carrier: Carrier):
@@ -68,7 +68,8 @@ class Session:
         if refused or theirs != (messages.PROTOCOL, DICTIONARY):
             raise LinkForeign(
                 f"the firmware speaks protocol {theirs[0]}, dictionary {theirs[1]:08x}; "
-                f"this program speaks protocol {messages.PROTOCOL}, dictionary {DICTIONARY:08x}: flash the firmware of this version"
+                f"this program speaks protocol {messages.PROTOCOL}, dictionary {DICTIONARY:08x}: "
+                "flash the firmware of this version"
             )
         self.flush()
 
@@ -103,12 +104,16 @@ class Session:
         """Take all pulses away."""
         self._post("kill")
 
-    def weight_targets(self, frame: int, targets_q28: dict[int, int], on_refused: Callable[[int, int], None] | None = None) -> None:
+    def weight_targets(
+        self, frame: int, targets_q28: dict[int, int], on_refused: Callable[[int, int], None] | None = None
+    ) -> None:
         """Send weight targets by index of action, to act in `frame` or at once (FRAME_NOW)."""
         items = [{"action": action, "target_q28": target} for action, target in targets_q28.items()]
         self._post_items("weight_targets", frame, items, on_refused)
 
-    def live_targets(self, frame: int, targets_q28: dict[int, int], on_refused: Callable[[int, int], None] | None = None) -> None:
+    def live_targets(
+        self, frame: int, targets_q28: dict[int, int], on_refused: Callable[[int, int], None] | None = None
+    ) -> None:
         """Send targets of live channels by index, to act in `frame` or at once (FRAME_NOW)."""
         items = [{"live": live, "target_q28": target} for live, target in targets_q28.items()]
         self._post_items("live_targets", frame, items, on_refused)
@@ -184,4 +189,3 @@ class Session:
         if self.link.counters.bytes:
             return LinkForeign("what answers at this port is not Marotte's firmware; flash it, or choose another port")
         return LinkSilent(f"no answer within {timeout_s:g} s: is the firmware running on the MCU?")
-

@@ -5,8 +5,8 @@
         mcu.run_for(100_000)
         print(mcu.receive())
 
-Computing takes no time here. The pins follow a model of the Pico's PWM: periods of 20 ms that begin when a pin is first used, and
-a new pulse width takes effect with the next period.
+Computing takes no time here. The pins follow a model of the Pico's PWM: periods of 20 ms that begin when a pin is first
+used, and a new pulse width takes effect with the next period.
 """
 
 from __future__ import annotations
@@ -38,10 +38,11 @@ _ARRIVAL_MAX = 0xFFFF
 
 
 class UnixMcu(VirtualMcu):
-    """MicroPython's unix port, `bits` wide (64 or 32), or any `micropython` by path, with the firmware of this checkout.
+    """MicroPython's unix port with the firmware of this checkout.
 
-    `folder` is its working directory, which stands in for the flash; default is an empty one that goes with the MCU. Raises
-    MarotteError if there is no binary, and later if the firmware fails.
+    Its words have 64 or 32 `bits`; `binary` names another `micropython` than the one that is built for them.
+    `folder` is its working directory, which stands in for the flash; default is an empty one that goes with the MCU.
+    Raises MarotteError if there is no binary, and later if the firmware fails.
     """
 
     def __init__(self, bits: int = 64, binary: Path | None = None, folder: Path | None = None):
