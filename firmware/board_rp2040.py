@@ -149,6 +149,7 @@ class Board:
         for pin in range(_LAST_PIN + 1):
             if attached[pin]:
                 machine.Pin(pin, machine.Pin.OUT, value=0)
+                _compare(_PWM_WORD + ((pin >> 1) & 7) * _SLICE_WORDS, pin & 1, 0)
                 attached[pin] = 0
 
     def heap_free(self):

@@ -258,8 +258,10 @@ class Link:
         self._detail = puppet.staged.missing()
         if self._detail:
             return messages.INCOMPLETE
-        puppet.commit()
-        return messages.OK
+        bad = self._judge(puppet.staged.doubled())
+        if bad == messages.OK:
+            puppet.commit()
+        return bad
 
     def _on_start(self, body, length):
         if not self._puppet.tables.ready:

@@ -217,6 +217,18 @@ class Tables:
         self._lives_seen += 1
         return None
 
+    def doubled(self):
+        """Return the first action that maps a DOF twice, or None: the compositor's sums have no room for that."""
+        for action in range(self.actions):
+            mapped = 0
+            first = self.first_mapping[action]
+            for mapping in range(first, first + self.mapping_count[action]):
+                bit = 1 << self.mapped_dof[mapping]
+                if mapped & bit:
+                    return action
+                mapped |= bit
+        return None
+
     def missing(self):
         """Return how many of the announced parts have not come."""
         return (
