@@ -16,6 +16,8 @@ from micropython import const
 
 _UART_BAUD = const(115200)
 _LAST_PIN = const(28)
+_CTRL_C = const(3)
+_CTRL_C = const(3)
 _PWM_WORD = const(0x10014000)  # address of the PWM block, 0x40050000, in words
 _SLICE_WORDS = const(5)
 _DIVIDER = const(640)  # 40 in the register's Q4
@@ -92,7 +94,10 @@ class Board:
                 break
 
     def receive(self, buffer):
-        """Read what has arrived into `buffer`, at most its length; return the number of bytes. Never waits."""
+        """Read what has arrived into `buffer`, at most its length; return the number of bytes. Never waits.
+
+        Over USB a Ctrl-C (0x03) is the last byte of a read: if it calls for the REPL, what follows is meant for that.
+        """
         count = 0
         room = len(buffer)
         byte = self._byte
@@ -105,6 +110,10 @@ class Board:
             self._stdin.readinto(byte)
             buffer[count] = byte[0]
             count += 1
+            if byte[0] == _CTRL_C:
+                break
+            if byte[0] == _CTRL_C:
+                break
         if count:
             self._to_uart = False
         elif self._uart.any():

@@ -18,6 +18,8 @@ from firmware.clock import TICKS_MASK
 
 _RECORD = const(7)
 _ROOM = const(4096)
+_CTRL_C = const(3)
+_CTRL_C = const(3)
 
 
 class Board:
@@ -57,14 +59,22 @@ class Board:
                 self._next_stretch()
 
     def receive(self, buffer):
-        """Read what has arrived into `buffer`, at most its length; return the number of bytes. Never waits."""
+        """Read what has arrived into `buffer`, at most its length; return the number of bytes. Never waits.
+
+        A Ctrl-C (0x03) is the last byte of a read: if it calls for the REPL, what follows is meant for that.
+        """
         count = 0
         room = len(buffer)
         while count < room and self._arrived():
-            buffer[count] = self._arrivals[self._at]
+            byte = self._arrivals[self._at]
+            buffer[count] = byte
             count += 1
             self._at += 1
             self._count -= 1
+            if buffer[count - 1] == _CTRL_C:
+                break
+            if byte == _CTRL_C:
+                break
         return count
 
     def send(self, buffer, length):

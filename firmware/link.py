@@ -5,6 +5,9 @@ good as lost; one that comes after a gap is answered with the number that is exp
 answer. `hello` begins a session with whatever number it has. Nothing here allocates while a puppet plays: tables are
 what `begin` .. `commit` bring, and those come first.
 
+The REPL is called for by `0D 03` where a packet would begin and then a pause, another `0D`, or another `03`, as mpremote and others
+do it. `0D 03` alone would not do: a single flipped bit can make a packet begin with it, and would end the performance.
+
 A reader of the wire must not trust it: kernels get only indices and lengths that were checked here, in `tables` or in
 `cues`.
 """
@@ -101,6 +104,7 @@ class Link:
         self._puppet = puppet
         self._dictionary = codec.crc32(messages.canonical_text().encode())
         self._chunk = bytearray(_CHUNK)
+        self._single = bytearray(1)
         self._wire = bytearray(codec.WIRE_MAX)
         self._length = 0
         self._out = bytearray(codec.BODY_MAX)
@@ -132,21 +136,28 @@ class Link:
         now_us = board.ticks_us()
         if ticks_diff(now_us, self._heard_us) > self._puppet.tables.link_timeout_ms * 1000:
             self.silent = True
-        end = board.receive(self._chunk)
+        wire = self._wire
+        chunk = self._chunk
+        if self._length == 2 and wire[0] == codec.HANDOVER_FIRST and wire[1] == codec.HANDOVER_SECOND:
+            # One byte at a time now, so that what follows is left for the REPL.
+            end = board.receive(self._single)
+            if end == 0:
+                return ticks_diff(now_us, self._byte_us) > _STALE_US
+            chunk[0] = self._single[0]
+            if chunk[0] == codec.HANDOVER_FIRST or chunk[0] == codec.HANDOVER_SECOND:
+                return True
+        else:
+            end = board.receive(chunk)
         if end == 0:
             return False
         if self._length and ticks_diff(now_us, self._byte_us) > _STALE_US:
             self._length = 0
             self.damaged += 1
         self._byte_us = now_us
-        chunk = self._chunk
-        wire = self._wire
         start = 0
         while start < end:
             stop = _collect(chunk, start, end, wire, self._length, codec.WIRE_MAX)
             self._length += stop - start
-            if self._length >= 2 and wire[0] == codec.HANDOVER_FIRST and wire[1] == codec.HANDOVER_SECOND:
-                return True
             start = stop + 1
             if stop < end:
                 length = self._length
