@@ -111,6 +111,7 @@ class _Command:
     name: str
     packet: bytes
     sent_us: int
+    repeated: bool
     on_refused: Callable[[int, int], None] | None
 
 
@@ -157,6 +158,7 @@ class Link:
         self._backlog: deque[_Command] = deque()
         self._under_way: deque[_Command] = deque()
         self._partial = b""
+        self._refusals: deque[LinkRefused] = deque()
 
     @property
     def pending(self) -> int:
@@ -175,7 +177,7 @@ class Link:
         `on_refused(status, detail)` is called if the MCU refuses it; without, `pump` raises LinkRefused.
         """
         packet = wire_packet(_BY_NAME[name][1], self._seq, pack(name, fields or {}, items))
-        self._backlog.append(_Command(self._seq, name, packet, 0, on_refused))
+        self._backlog.append(_Command(self._seq, name, packet, 0, False, on_refused))
         self._seq = (self._seq + 1) & 255
         self._send_what_fits()
 
@@ -195,11 +197,14 @@ class Link:
             if now_us - self._under_way[0].sent_us > RETRY_US:
                 self._repeat(now_us)
         self._send_what_fits()
+        if self._refusals:  # raised when all else is done, so that nothing that has come is lost
+            raise self._refusals.popleft()
 
     def forget(self) -> None:
         """Drop all commands that are not acknowledged: for a new session."""
         self._backlog.clear()
         self._under_way.clear()
+        self._refusals.clear()
 
     def _send_what_fits(self) -> None:
         if not self._under_way:
@@ -214,6 +219,7 @@ class Link:
     def _repeat(self, now_us: int) -> None:
         for command in self._under_way:
             command.sent_us = now_us
+            command.repeated = True
             self._carrier.write(command.packet)
             self.counters.repeated += 1
 
@@ -240,7 +246,7 @@ class Link:
         if status == messages.RESEND:
             now_us = self._carrier.now_us()
             first = self._under_way[0] if self._under_way else None
-            if first and first.seq == detail & 255 and now_us - first.sent_us > HURRY_US:
+            if first and first.seq == detail & 255 and (not first.repeated or now_us - first.sent_us > HURRY_US):
                 self._repeat(now_us)
             return
         if not self._under_way or self._under_way[0].seq != seq:
@@ -250,7 +256,9 @@ class Link:
             return
         if command.on_refused is None:
             text = messages.STATUS_TEXT[status] if status < len(messages.STATUS_TEXT) else f"status {status}"
-            raise LinkRefused(f"the MCU refused {command.name!r}: {text} (detail {detail})", status, detail)
+            refusal = LinkRefused(f"the MCU refused {command.name!r}: {text} (detail {detail})", status, detail)
+            self._refusals.append(refusal)
+            return
         command.on_refused(status, detail)
 
 
