@@ -41,7 +41,7 @@ def is_command(wire: bytes) -> bool:
 
 def is_call(wire: bytes) -> bool:
     """Whether bytes between two zeros begin as mpremote does when it wants the REPL."""
-    return wire[:3] in (b"\r\x03\r", b"\r\x03\x03") or wire == b"\r\x03"
+    return wire[:3] in (b"\r\x03\r", b"\r\x03\x03")
 
 
 def any_packet(rng: random.Random, seq: int) -> bytes:

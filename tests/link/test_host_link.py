@@ -1,0 +1,258 @@
+"""The host's end of the link against an MCU that follows a script: losses, gaps, repetitions, silence, and strangers."""
+
+import itertools
+
+import pytest
+
+from marotte.link import (
+    HURRY_US,
+    RETRY_US,
+    SILENT_US,
+    WINDOW,
+    Link,
+    LinkRefused,
+    LinkSilent,
+    pack,
+    wire_packet,
+)
+from marotte.session import DICTIONARY, OPEN_TIMEOUT_S, LinkForeign, Session
+from shared import messages
+from tests.link.carriers import ScriptedCarrier, ack
+
+STEP_US = 1000
+DELAY_US = 3000
+
+
+def settle(link, limit_us=3_000_000):
+    """Pump until all commands are acknowledged."""
+    waited_us = 0
+    while link.pending:
+        link.pump(STEP_US)
+        waited_us += STEP_US
+        assert waited_us < limit_us
+    return waited_us
+
+
+def link_to(script):
+    """A link to a scripted MCU, with its carrier and the list of the messages that come."""
+    carrier = ScriptedCarrier(script)
+    received = []
+    return Link(carrier, received.append), carrier, received
+
+
+def faithful(number, message_id, seq):
+    return ack(seq), DELAY_US
+
+
+def test_link_keeps_no_more_than_its_window_under_way():
+    link, carrier, _ = link_to(faithful)
+    for _ in range(3 * WINDOW):
+        link.post("ping")
+    assert len(carrier.arrived) == WINDOW
+    assert link.pending == 3 * WINDOW
+    settle(link)
+    assert [seq for _, seq, _ in carrier.arrived] == list(range(3 * WINDOW))
+    assert link.counters.repeated == 0
+
+
+def test_link_numbers_commands_modulo_256():
+    link, carrier, _ = link_to(faithful)
+    for _ in range(600):
+        link.post("ping")
+    settle(link)
+    assert [seq for _, seq, _ in carrier.arrived] == [number % 256 for number in range(600)]
+
+
+def test_link_repeats_what_is_not_acknowledged_in_time():
+    link, carrier, _ = link_to(lambda number, _, seq: (b"" if number == 0 else ack(seq), DELAY_US))
+    link.post("ping")
+    assert settle(link) == pytest.approx(RETRY_US + DELAY_US, abs=2 * STEP_US)
+    assert [seq for _, seq, _ in carrier.arrived] == [0, 0]
+    assert link.counters.repeated == 1
+
+
+def test_link_repeats_all_that_follow_a_lost_command_in_their_order():
+    def script(number, message_id, seq):
+        if number == 1:
+            return b"", DELAY_US  # lost on the way
+        if 1 < number < 5:
+            return ack(seq, messages.RESEND, 1), DELAY_US
+        return ack(seq), DELAY_US
+
+    link, carrier, _ = link_to(script)
+    for _ in range(5):
+        link.post("ping")
+    waited_us = settle(link)
+    assert [seq for _, seq, _ in carrier.arrived] == [0, 1, 2, 3, 4, 1, 2, 3, 4]
+    assert waited_us < RETRY_US / 2, "a gap that the MCU reports is filled at once"
+
+
+def test_link_hurries_once_for_all_that_report_a_gap():
+    def script(number, message_id, seq):
+        return (
+            (b"", 0)
+            if number == 0
+            else (ack(seq, messages.RESEND, 0), DELAY_US)
+            if number < 8
+            else (ack(seq), DELAY_US)
+        )
+
+    link, carrier, _ = link_to(script)
+    for _ in range(8):
+        link.post("ping")
+    settle(link)
+    assert [seq for _, seq, _ in carrier.arrived] == [*range(8), *range(8)]
+    assert carrier.arrived[8][2] - carrier.arrived[0][2] >= min(DELAY_US, HURRY_US)
+
+
+@pytest.mark.parametrize(
+    ("name", "answers"),
+    [
+        ("twice", lambda seq: ack(seq) + ack(seq)),
+        ("with a zero more", lambda seq: b"\0" + ack(seq) + b"\0"),
+        ("after an old one", lambda seq: ack((seq - 1) & 255) + ack(seq)),
+        ("after one of the future", lambda seq: ack((seq + 3) & 255) + ack(seq)),
+        ("after a damaged one", lambda seq: ack(seq, messages.STATE)[:-3] + b"\x55\0" + ack(seq)),
+        ("after text", lambda seq: b"Traceback (most recent call last):\r\n\0" + ack(seq)),
+        ("after a message that does not exist", lambda seq: wire_packet(0xF0, 0, b"?") + ack(seq)),
+        ("after a message of another length", lambda seq: wire_packet(messages.ACK, 0, b"???") + ack(seq)),
+        ("after a gap that is none", lambda seq: ack(seq, messages.RESEND, (seq + 9) & 255) + ack(seq)),
+    ],
+)
+def test_link_takes_an_answer(name, answers):
+    link, carrier, received = link_to(lambda number, _, seq: (answers(seq), DELAY_US))
+    for _ in range(20):
+        link.post("ping")
+    settle(link)
+    assert [seq for _, seq, _ in carrier.arrived] == list(range(20)), name
+    assert received == []
+
+
+def test_link_takes_an_answer_that_comes_in_pieces():
+    link, carrier, received = link_to(faithful)
+    telemetry = wire_packet(messages.WEIGHTS, 5, pack("weights", {"frame": 7}, [{"action": 1, "weight_q12": 4096}]))
+    pieces = [telemetry[:1], telemetry[1:4], telemetry[4:], telemetry[:-1], telemetry[-1:]]
+    carrier.read = lambda wait_us: pieces.pop(0)
+    while pieces:
+        link.pump(STEP_US)
+    assert [(message.name, message.fields, message.items) for message in received] == [
+        ("weights", {"frame": 7}, [{"action": 1, "weight_q12": 4096}])
+    ] * 2
+    assert link.counters.received == 2 and link.counters.damaged == 0
+
+
+def test_link_keeps_little_of_what_never_ends():
+    link, carrier, _ = link_to(faithful)
+    carrier.read = lambda wait_us: b"x" * 5000
+    for _ in range(50):
+        link.pump(STEP_US)
+    assert len(link._partial) < 2000
+
+
+def test_link_tells_a_refusal_by_error_or_callback():
+    link, _, _ = link_to(lambda number, _, seq: (ack(seq, messages.RANGE, 258), DELAY_US))
+    link.post("stop")
+    with pytest.raises(LinkRefused, match="refused 'stop': a field is out of range") as refusal:
+        settle(link)
+    assert (refusal.value.status, refusal.value.detail) == (messages.RANGE, 258)
+    told = []
+    link.post("stop", on_refused=lambda status, detail: told.append((status, detail)))
+    settle(link)
+    assert told == [(messages.RANGE, 258)]
+
+
+def test_link_goes_on_after_a_refusal():
+    link, carrier, _ = link_to(lambda number, _, seq: (ack(seq, 99 if seq == 2 else messages.OK), DELAY_US))
+    for _ in range(12):
+        link.post("ping")
+    with pytest.raises(LinkRefused, match="status 99"):
+        settle(link)
+    settle(link)
+    assert [seq for _, seq, _ in carrier.arrived] == list(range(12))
+
+
+def test_link_without_answers_is_silent_in_a_second():
+    link, carrier, _ = link_to(lambda *_: (b"", 0))
+    link.pump(10 * SILENT_US)  # nothing is under way, so nobody is waited for
+    start_us = carrier.now_us()
+    link.post("ping")
+    with pytest.raises(LinkSilent, match="has not answered for 1 s"):
+        settle(link)
+    assert carrier.now_us() - start_us == pytest.approx(SILENT_US, abs=2 * STEP_US)
+    assert link.counters.repeated == pytest.approx(SILENT_US / RETRY_US, abs=1)
+
+
+def welcome(protocol=messages.PROTOCOL, dictionary=DICTIONARY):
+    fields = {name: 0 for name, _ in messages.find(messages.WELCOME)[2]} | {
+        "protocol": protocol,
+        "dictionary": dictionary,
+    }
+    return wire_packet(messages.WELCOME, 0, pack("welcome", fields))
+
+
+@pytest.mark.parametrize("lost", [0, 1, 3])
+def test_session_opens_although_greetings_are_lost(lost):
+    carrier = ScriptedCarrier(lambda number, _, seq: (b"" if number < lost else ack(seq) + welcome(), DELAY_US))
+    session = Session(carrier)
+    session.open()
+    assert session.welcome["dictionary"] == DICTIONARY
+    assert {message_id for message_id, _, _ in carrier.arrived} == {messages.HELLO}
+    session.stop()
+    session.flush()
+
+
+def test_session_with_nobody_says_so_within_two_seconds():
+    carrier = ScriptedCarrier(lambda *_: (b"", 0))
+    with pytest.raises(LinkSilent, match=r"no answer within 1.5 s: is the firmware running"):
+        Session(carrier).open()
+    assert carrier.now_us() <= OPEN_TIMEOUT_S * 1e6 + 2 * STEP_US
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [b">>> \r\n>>> ", b"\0" * 40, bytes(range(256)), ack(0)[:-2] + b"\0", wire_packet(0x55, 0, b"hello")],
+    ids=["a REPL", "zeros", "all bytes", "a damaged packet", "packets of others"],
+)
+def test_session_with_something_else_says_so_within_two_seconds(answer):
+    carrier = ScriptedCarrier(lambda *_: (answer, DELAY_US))
+    with pytest.raises(LinkForeign, match="not Marotte's firmware"):
+        Session(carrier).open()
+    assert carrier.now_us() <= OPEN_TIMEOUT_S * 1e6 + 2 * STEP_US
+
+
+@pytest.mark.parametrize(
+    ("protocol", "dictionary", "status"),
+    [
+        (messages.PROTOCOL + 1, DICTIONARY, messages.MISMATCH),
+        (messages.PROTOCOL, DICTIONARY ^ 0x1234, messages.MISMATCH),
+        (messages.PROTOCOL + 1, DICTIONARY, messages.OK),
+        (messages.PROTOCOL, DICTIONARY, messages.MISMATCH),
+    ],
+)
+def test_session_refuses_another_version_with_both_numbers(protocol, dictionary, status):
+    carrier = ScriptedCarrier(lambda number, _, seq: (ack(seq, status) + welcome(protocol, dictionary), DELAY_US))
+    with pytest.raises(LinkForeign) as refusal:
+        Session(carrier).open()
+    text = str(refusal.value)
+    assert f"the firmware speaks protocol {protocol}, dictionary {dictionary:08x}" in text
+    assert f"this program speaks protocol {messages.PROTOCOL}, dictionary {DICTIONARY:08x}" in text
+    assert "flash" in text
+
+
+def test_session_pings_when_it_has_nothing_to_say():
+    carrier = ScriptedCarrier(lambda number, message_id, seq: (ack(seq) + welcome() * (number == 0), DELAY_US))
+    session = Session(carrier)
+    session.open()
+    for _ in range(500):
+        session.pump(2000)
+    pings = [at_us for message_id, _, at_us in carrier.arrived if message_id == messages.PING]
+    assert 9 <= len(pings) <= 10
+    assert max(b - a for a, b in itertools.pairwise(pings)) < 200_000
+
+
+def test_session_splits_targets_into_messages_that_fit():
+    carrier = ScriptedCarrier(faithful)
+    session = Session(carrier)
+    session.weight_targets(9, {action: action << 20 for action in range(64)})
+    session.flush()
+    assert [message_id for message_id, _, _ in carrier.arrived] == [messages.WEIGHT_TARGETS] * 2
