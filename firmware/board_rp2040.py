@@ -17,7 +17,6 @@ from micropython import const
 _UART_BAUD = const(115200)
 _LAST_PIN = const(28)
 _CTRL_C = const(3)
-_CTRL_C = const(3)
 _PWM_WORD = const(0x10014000)  # address of the PWM block, 0x40050000, in words
 _SLICE_WORDS = const(5)
 _DIVIDER = const(640)  # 40 in the register's Q4
@@ -110,8 +109,6 @@ class Board:
             self._stdin.readinto(byte)
             buffer[count] = byte[0]
             count += 1
-            if byte[0] == _CTRL_C:
-                break
             if byte[0] == _CTRL_C:
                 break
         if count:

@@ -19,7 +19,6 @@ from firmware.clock import TICKS_MASK
 _RECORD = const(7)
 _ROOM = const(4096)
 _CTRL_C = const(3)
-_CTRL_C = const(3)
 
 
 class Board:
@@ -71,8 +70,6 @@ class Board:
             count += 1
             self._at += 1
             self._count -= 1
-            if buffer[count - 1] == _CTRL_C:
-                break
             if byte == _CTRL_C:
                 break
         return count
