@@ -35,10 +35,11 @@ demo: setup ## play the pet's score on an emulated RP2040 with the real firmware
 test: setup ## run the tests; ARGS='-k NAME' chooses
 	$(call with_images, $(VENV)/pytest $(ARGS), MAROTTE_NO_IMAGES=1 $(VENV)/pytest $(ARGS))
 
-check: setup ## look at the sources: ruff and mypy
+check: setup ## look at the sources: ruff, mypy, and MicroPython's own compiler
 	$(VENV)/ruff check .
 	$(VENV)/ruff format --check host tools/*.py tests
 	$(VENV)/mypy
+	$(VENV)/python tools/check_firmware.py
 
 format: setup ## bring the sources into form
 	$(VENV)/ruff format host tools/*.py tests

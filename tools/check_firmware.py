@@ -16,6 +16,7 @@ from marotte.images import mpy_cross
 
 ROOT = Path(__file__).resolve().parent.parent
 FILES = sorted([*ROOT.glob("firmware/**/*.py"), *ROOT.glob("shared/*.py")])
+ON_THE_MCU = [file for file in FILES if file.name != "cpython.py"]  # which stands in for MicroPython, on the PC
 CONFIG = ROOT / "tools" / "check_firmware.ini"
 
 
@@ -48,10 +49,10 @@ def compiles():
     """Run MicroPython's compiler over the firmware; return whether it took every file."""
     compiler = mpy_cross(micropython_sources())
     good = True
-    for file in FILES:
+    for file in ON_THE_MCU:
         words = [compiler, "-march=armv6m", "-o", os.devnull, file]
         good = subprocess.run(words, cwd=ROOT).returncode == 0 and good
-    print(f"mpy-cross: {len(FILES)} files")
+    print(f"mpy-cross: {len(ON_THE_MCU)} files")
     return good
 
 
