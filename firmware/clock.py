@@ -68,7 +68,7 @@ class FrameClock:
         if self._remainder >= rate_hz:
             self._remainder -= rate_hz
             period_us += 1
-        self.due_us = (self.due_us + period_us) & TICKS_MASK
+        self.due_us = (self.due_us - (TICKS_MASK - period_us) - 1) & TICKS_MASK  # the plain sum may pass 2^30
 
 
 @micropython.viper
