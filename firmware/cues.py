@@ -15,6 +15,8 @@ from shared.formats import (
     MASTER_TEMPO_MAX_Q16,
     MASTER_TEMPO_MIN_Q16,
     QUEUE_MAX,
+    TEMPO_MAX_Q16,
+    TEMPO_MIN_Q16,
     WEIGHT_MAX,
     WEIGHT_ONE,
 )
@@ -22,6 +24,7 @@ from shared.formats import (
 WEIGHT = const(0)
 LIVE = const(1)
 TEMPO = const(2)
+MASTER_INDEX = const(255)
 _NOW = const(128)  # added to the kind of a target that acts in the next frame and cannot be late
 
 
@@ -95,9 +98,13 @@ def _apply(
     weight_target_q28: ptr32,
     live_target_q28: ptr32,
     tempo_q16: ptr32,
-    late: ptr32,
+    action_tempo_q16: ptr32,
+    counts: ptr32,
 ) -> int:
-    """Let all targets stamped `frame` or earlier act; return how many wait. `late[0]` counts the late ones."""
+    """Let all targets stamped `frame` or earlier act; return how many wait.
+
+    `counts[0]` counts the late ones, `counts[1]` the tempos of actions.
+    """
     kept = 0
     n = 0
     while n < count:
@@ -105,14 +112,17 @@ def _apply(
             kind = int(queue_kind[n])
             if kind < 128:
                 if queue_frame[n] < frame:
-                    late[0] = late[0] + 1
+                    counts[0] = counts[0] + 1
             kind = kind & 127
             if kind == WEIGHT:
                 weight_target_q28[queue_index[n]] = queue_value[n]
             elif kind == LIVE:
                 live_target_q28[queue_index[n]] = queue_value[n]
-            else:
+            elif queue_index[n] == MASTER_INDEX:
                 tempo_q16[0] = queue_value[n]
+            else:
+                action_tempo_q16[queue_index[n]] = queue_value[n]
+                counts[1] = counts[1] + 1
         else:
             if kept != n:
                 queue_frame[kept] = queue_frame[n]
@@ -125,15 +135,16 @@ def _apply(
 
 
 class Cues:
-    """The queue of stamped targets; `late[0]` counts targets that came after their frame and acted at once.
+    """The queue of stamped targets.
 
+    `counts[0]` counts targets that came after their frame and acted at once, `counts[1]` tempos of actions that acted.
     `detail` explains the last refusal: the number of the bad field, or the free places.
     """
 
     def __init__(self):
         self.count = 0
         self.detail = 0
-        self.late = array("i", (0,))
+        self.counts = array("i", (0, 0))
         self._frame = array("i", bytes(4 * QUEUE_MAX))
         self._kind = bytearray(QUEUE_MAX)
         self._index = bytearray(QUEUE_MAX)
@@ -153,11 +164,13 @@ class Cues:
         if self.count + items > QUEUE_MAX:
             self.detail = QUEUE_MAX - self.count
             return messages.FULL
+        first = least = 0
         if kind == TEMPO:
-            first, indices = MASTER, 1
-            least, most = MASTER_TEMPO_MIN_Q16, MASTER_TEMPO_MAX_Q16
+            least, most = TEMPO_MIN_Q16, TEMPO_MAX_Q16
+            if items == 1 and body[start + 4] == MASTER:
+                first, indices = MASTER, 1
+                least, most = MASTER_TEMPO_MIN_Q16, MASTER_TEMPO_MAX_Q16
         else:
-            first = least = 0
             most = WEIGHT_MAX if kind == WEIGHT else WEIGHT_ONE
         # fmt: off
         bad = _put(
@@ -171,11 +184,11 @@ class Cues:
         self.count += items
         return messages.OK
 
-    def apply(self, frame, weight_target_q28, live_target_q28, tempo_q16):
+    def apply(self, frame, weight_target_q28, live_target_q28, tempo_q16, action_tempo_q16):
         """Let the targets due in `frame` act on the arrays; `tempo_q16[0]` is the master tempo."""
         # fmt: off
         self.count = _apply(
             frame, self.count, self._frame, self._kind, self._index, self._value,
-            weight_target_q28, live_target_q28, tempo_q16, self.late,
+            weight_target_q28, live_target_q28, tempo_q16, action_tempo_q16, self.counts,
         )
         # fmt: on

@@ -78,6 +78,9 @@ _RSIN = const(0)
 _RCOS = const(1)
 _NOISE = const(2)
 _CONST = const(3)
+_LIVE = const(4)
+_CURVE = const(5)
+_ELSEWHERE = const(255)
 
 
 @micropython.viper
@@ -90,15 +93,22 @@ def evaluate(
     mappings: ptr8,
     function: ptr8,
     argument: ptr16,
+    same: ptr16,
     sine: ptr16,
     gradients: ptr16,
     live_q28: ptr32,
+    curve_start: ptr16,
+    curve_samples: ptr16,
+    samples_q15: ptr16,
     value_q15: ptr16,
 ):
     """Write the function value of every mapping of the playing actions to `value_q15`, Q15 in 0..32768.
 
+    Programs, blinks and repetitions of a function within its action are left to `programs`, `blinks` and `repeat`.
+
     Noise: with `j` whole and `u` the fraction, `h = u * (1-u) * (g[j] * (1-u) - g[j+1] * u)`, the value is `1/2 + 2 *
     h`. Bits: `u` and `g` in Q15, so their products stay within 2^30, and as `(1-u) + u = 1` so does their difference.
+    A curve's place is the phase in Q22 times at most 256 samples: 2^30.
     """
     n = 0
     while n < found:
@@ -108,6 +118,8 @@ def evaluate(
         end = m + int(mappings[i])
         while m < end:
             code = int(function[m])
+            if int(same[m]) != m:
+                code = _ELSEWHERE
             if code <= 1:
                 angle = phase
                 if code == _RCOS:
@@ -126,10 +138,41 @@ def evaluate(
                 f = 16384 + ((((u * v + 0x2000) >> 14) * slope + 0x4000) >> 15)
             elif code == _CONST:
                 f = int(argument[m])
-            else:
+            elif code == _LIVE:
                 f = (live_q28[int(argument[m])] + 0x1000) >> 13
                 if f > 32768:
                     f = 32768
+            elif code == _CURVE:
+                k = int(argument[m])
+                samples = int(curve_samples[k])
+                place = ((phase + 2) >> 2) * samples
+                j = place >> 22
+                if j >= samples:
+                    j = 0
+                    place = 0
+                u = (place & 0x3FFFFF) >> 7
+                first = int(curve_start[k])
+                a = int(samples_q15[first + j])
+                j += 1
+                if j == samples:
+                    j = 0
+                f = a + (((int(samples_q15[first + j]) - a) * u + 0x4000) >> 15)
+            else:
+                f = 0
             value_q15[m] = f
+            m += 1
+        n += 1
+
+
+@micropython.viper
+def repeat(playing: ptr8, found: int, first_mapping: ptr16, mappings: ptr8, same: ptr16, value_q15: ptr16):
+    """Copy the values of functions that stand in their action already: `same[m]` is the mapping that has computed it."""
+    n = 0
+    while n < found:
+        i = int(playing[n])
+        m = int(first_mapping[i])
+        end = m + int(mappings[i])
+        while m < end:
+            value_q15[m] = value_q15[same[m]]
             m += 1
         n += 1

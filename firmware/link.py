@@ -259,6 +259,32 @@ class Link:
     def _on_live(self, body, length):
         return self._staged() or self._judge(self._puppet.staged.live(*self._fields(messages.LIVE, body)))
 
+    def _on_curve(self, body, length):
+        staged = self._puppet.staged
+        return self._staged() or self._stream(messages.CURVE, body, length, staged.curve, staged.sample)
+
+    def _on_program(self, body, length):
+        staged = self._puppet.staged
+        return self._staged() or self._stream(messages.PROGRAM, body, length, staged.program, staged.word)
+
+    def _on_blink(self, body, length):
+        return self._staged() or self._judge(self._puppet.staged.blink(*self._fields(messages.BLINK, body)))
+
+    def _on_keep(self, body, length):
+        return messages.STATE
+
+    def _stream(self, message_id, body, length, begin, store):
+        """Store what comes in several packets: the fields to `begin`, then each item to `store`."""
+        bad = begin(*self._fields(message_id, body))
+        if bad is not None:
+            return self._judge(bad)
+        item = self._item[message_id]
+        for place in range(_PAYLOAD + 3, _PAYLOAD + length, item):
+            (value,) = unpack_from("<i" if item == 4 else "<H", body, place)
+            if store(value) is not None:
+                return self._judge(2 + (place - _PAYLOAD - 3) // item)
+        return messages.OK
+
     def _on_commit(self, body, length):
         puppet = self._puppet
         if puppet.frame >= 0:
@@ -291,7 +317,7 @@ class Link:
         return self._queue(cues.LIVE, length, self._puppet.tables.lives)
 
     def _on_tempo(self, body, length):
-        return self._queue(cues.TEMPO, length, 0)
+        return self._queue(cues.TEMPO, length, self._puppet.tables.actions)
 
     def _on_arm(self, body, length):
         puppet = self._puppet
@@ -352,7 +378,7 @@ class Link:
             self._send(messages.TAPS, length)
         if self._weights_every and frame % self._weights_every == 0:
             self._pack_frame(frame)
-            self._send(messages.WEIGHTS, _pack_weights(out, 6, puppet.found, puppet.playing, puppet.w_q28))
+            self._send(messages.WEIGHTS, _pack_weights(out, 6, puppet.actions.found, puppet.actions.playing, puppet.actions.w_q28))
 
     def _pack_frame(self, frame):
         pack_into("<i", self._out, _PAYLOAD, frame)
@@ -380,7 +406,7 @@ class Link:
         # fmt: off
         pack_into(
             _STATUS_FORMAT, self._out, _PAYLOAD, puppet.frame, puppet.motor.armed, self.silent,
-            puppet.clock.late_max_us, puppet.clock.late_frames, puppet.frame_max_us, self.packets, self.damaged, puppet.cues.late[0],
+            puppet.clock.late_max_us, puppet.clock.late_frames, puppet.frame_max_us, self.packets, self.damaged, puppet.cues.counts[0],
             self._board.heap_free(),
         )
         # fmt: on

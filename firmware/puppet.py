@@ -4,12 +4,14 @@ Data runs one way: targets, weights, actions, functions, compositor, motor, boar
 that are made here once; a frame allocates nothing.
 """
 
-from firmware import actions, clock, compositor, functions, weights
+from firmware import clock, compositor, functions, weights
+from firmware.actions import Actions
+from firmware.blinks import Blinks
 from firmware.cues import Cues
 from firmware.motor import Motor
+from firmware.programs import Programs
 from firmware.tables import Tables, halves, words
 from shared.formats import (
-    ACTIONS_MAX,
     DOFS_MAX,
     GRADIENTS,
     LIVES_MAX,
@@ -37,21 +39,17 @@ class Puppet:
         self.staged = Tables()  # those that the host fills
         self.motor = Motor(board, self.tables)
         self.tempo_q16 = words(1)
+        self.actions = Actions()
         self.live_target_q28 = words(LIVES_MAX)
-        self.weight_target_q28 = words(ACTIONS_MAX)
-        self.w_q28 = words(ACTIONS_MAX)
         self.base_q15 = halves(DOFS_MAX)
         self.signal_q15 = self.base_q15  # until a signal processing layer stands between them
-        self.playing = bytearray(ACTIONS_MAX)
-        self.found = 0
         self._board = board
         self._sine = functions.sine_table()
         self._gradients = halves(NOISE_TABLES * GRADIENTS)
         self._drawn = None
         self._master = words(clock.PHASE_WORDS)
-        self._x_q28 = words(ACTIONS_MAX)
-        self._cycle = halves(ACTIONS_MAX)
-        self._fraction_q24 = words(ACTIONS_MAX)
+        self._blinks = Blinks()
+        self._programs = Programs()
         self._live_x_q28 = words(LIVES_MAX)
         self._live_w_q28 = words(LIVES_MAX)
         self._hold_target_q28 = words(DOFS_MAX)
@@ -74,6 +72,7 @@ class Puppet:
         if noise != self._drawn:
             functions.fill_gradients(self._gradients, tables.seed, tables.spread_q15)
             self._drawn = noise
+        tables.link_repeats()
         self.motor.load(tables)
         self._rest()
 
@@ -82,7 +81,7 @@ class Puppet:
         self._rest()
         self.frame = 0
         self.frame_max_us = 0
-        self.cues.late[0] = 0
+        self.cues.counts[0] = 0
         self.clock.start(self._board.ticks_us(), self.tables.frame_rate_hz)
 
     def stop(self):
@@ -98,6 +97,7 @@ class Puppet:
         self.clock.begin(begun_us)
         self._synthesise()
         self.motor.move(self.signal_q15, silent)
+        self.actions.warp(self.tables, self.tempo_q16[0], self.clock.rate_hz)
         clock.advance(self._master, self.tempo_q16[0], self.clock.rate_hz)
         self.frame += 1
         took_us = clock.ticks_diff(self._board.ticks_us(), begun_us)
@@ -107,44 +107,55 @@ class Puppet:
     # fmt: off
     def _synthesise(self):
         t = self.tables
-        self.cues.apply(self.frame, self.weight_target_q28, self.live_target_q28, self.tempo_q16)
+        a = self.actions
+        rate_hz = self.clock.rate_hz
+        counts = self.cues.counts
+        counts[1] = 0
+        self.cues.apply(self.frame, a.target_q28, self.live_target_q28, self.tempo_q16, a.wanted_tempo_q16)
+        a.compute_phases(t, self._master, rate_hz)
+        if counts[1]:
+            a.follow_tempos(t, self._master, rate_hz)
+        a.end_gestures(t)
         compositor.hold_targets(
-            t.actions, self.weight_target_q28, t.first_mapping, t.mapping_count, t.mapped_dof,
+            t.actions, a.target_q28, t.first_mapping, t.mapping_count, t.mapped_dof,
             t.dofs, t.relative, self.base_q15, self._hold_target_q28, self._hold_w_q28, self._hold_q15, self._wanted,
         )
-        weights.integrate(t.actions, self.weight_target_q28, self._x_q28, self.w_q28, t.rise_q26, t.fall_q26)
+        for n in range(a.enter(t, self._master, rate_hz)):
+            if a.risen[n] >= 128:
+                self._blinks.enter(t, a.risen[n] & 127)
+        weights.integrate(t.actions, a.target_q28, a.x_q28, a.w_q28, t.rise_q26, t.fall_q26)
         weights.integrate(
             t.lives, self.live_target_q28, self._live_x_q28, self._live_w_q28, t.live_rise_q26, t.live_fall_q26
         )
         weights.integrate(
             t.dofs, self._hold_target_q28, self._hold_x_q28, self._hold_w_q28, t.hold_q26, t.hold_q26
         )
-        found = actions.select(t.actions, self.weight_target_q28, self._x_q28, self.w_q28, self.playing)
-        actions.phases(
-            self.playing, found, self._master, self.clock.rate_hz, t.tempo_q16, self._cycle, self._fraction_q24
-        )
         functions.evaluate(
-            self.playing, found, self._cycle, self._fraction_q24, t.first_mapping, t.mapping_count, t.function,
-            t.argument, self._sine, self._gradients, self._live_w_q28, self._value_q15,
+            a.playing, a.found, a.cycle, a.fraction_q24, t.first_mapping, t.mapping_count, t.function,
+            t.argument, t.same, self._sine, self._gradients, self._live_w_q28, t.curve_start, t.curve_samples,
+            t.samples_q15, self._value_q15,
         )
+        if t.programs:
+            self._programs.evaluate(t, a, self._sine, self._gradients, self._live_w_q28, self._value_q15)
+        if t.blinks:
+            self._blinks.evaluate(t, a, self._sine, self._value_q15)
+        functions.repeat(a.playing, a.found, t.first_mapping, t.mapping_count, t.same, self._value_q15)
         compositor.blend(
-            self.playing, found, self.w_q28, t.first_mapping, t.mapping_count, t.mapped_dof, t.low_q15, t.high_q15,
+            a.playing, a.found, a.w_q28, t.first_mapping, t.mapping_count, t.mapped_dof, t.low_q15, t.high_q15,
             self._value_q15, t.dofs, self._hold_w_q28, self._hold_q15, self.base_q15,
             self._weight_sum, self._shift, self._upper, self._lower,
         )
-        self.found = found
     # fmt: on
 
     def _rest(self):
         """Set the state before frame 0: no action, HOLD and live channels at rest, tempo 1, phase 0."""
         tables = self.tables
         self.frame = -1
-        self.found = 0
         self.tempo_q16[0] = TEMPO_ONE
         for place in range(clock.PHASE_WORDS):
             self._master[place] = 0
-        for action in range(ACTIONS_MAX):
-            self.weight_target_q28[action] = self._x_q28[action] = self.w_q28[action] = 0
+        self.actions.rest(tables)
+        self._blinks.seed(tables)
         for live in range(tables.lives):
             rest_q28 = tables.live_rest_q28[live]
             self.live_target_q28[live] = self._live_x_q28[live] = self._live_w_q28[live] = rest_q28

@@ -6,15 +6,25 @@ that a kernel will use is checked here, because viper checks nothing. All arrays
 
 from array import array
 
+from firmware.programs import check as check_program
+from shared import program as isa
 from shared.formats import (
     ACTIONS_MAX,
     ALPHA_ONE,
+    BLINKS_MAX,
+    CURVES_MAX,
+    CYCLES_MAX,
     DOFS_MAX,
+    ENTRY_START,
     FRAME_RATE_MAX_HZ,
     FRAME_RATE_MIN_HZ,
+    FUNCTION_BLINK,
     FUNCTION_CONST,
+    FUNCTION_CURVE,
     FUNCTION_LIVE,
     FUNCTION_NOISE,
+    FUNCTION_PROGRAM,
+    FUNCTION_RTRIGSIN,
     KIND_RELATIVE,
     LIVES_MAX,
     MAPPINGS_MAX,
@@ -23,12 +33,14 @@ from shared.formats import (
     PULSE_BITS,
     PULSE_MAX_US,
     PULSE_MIN_US,
+    SAMPLES_MAX,
     TEMPO_MAX_Q16,
     TEMPO_MIN_Q16,
     VALUE_ONE,
     WEIGHT_ONE,
 )
 
+_GAP_MAX_Q18 = 1000 << 18
 _PULSE_MIN_Q4US = PULSE_MIN_US << PULSE_BITS
 _PULSE_MAX_Q4US = PULSE_MAX_US << PULSE_BITS
 
@@ -54,11 +66,11 @@ class Tables:
     def __init__(self):
         self.ready = False
         self.frame_rate_hz = 30
-        self.dofs = self.actions = self.mappings = self.lives = 0
+        self.dofs = self.actions = self.mappings = self.lives = self.curves = self.programs = self.blinks = 0
         self.seed = 0
         self.spread_q15 = 0
         self.link_timeout_ms = 500
-        self._dofs_seen = self._actions_seen = self._mappings_seen = self._lives_seen = 0
+        self._forget_seen()
         # per DOF
         self.relative = bytearray(DOFS_MAX)
         self.rest_q15 = halves(DOFS_MAX)
@@ -74,18 +86,36 @@ class Tables:
         self.fall_q26 = words(ACTIONS_MAX)
         self.first_mapping = halves(ACTIONS_MAX)
         self.mapping_count = bytearray(ACTIONS_MAX)
+        self.entry = bytearray(ACTIONS_MAX)
+        self.warp_q26 = words(ACTIONS_MAX)
+        self.cycles = halves(ACTIONS_MAX)
         # per mapping
         self.mapped_dof = bytearray(MAPPINGS_MAX)
         self.function = bytearray(MAPPINGS_MAX)
         self.argument = halves(MAPPINGS_MAX)
         self.low_q15 = halves(MAPPINGS_MAX)
         self.high_q15 = halves(MAPPINGS_MAX)
+        self.same = halves(MAPPINGS_MAX)
         # per live channel
         self.live_rest_q28 = words(LIVES_MAX)
         self.live_rise_q26 = words(LIVES_MAX)
         self.live_fall_q26 = words(LIVES_MAX)
+        # curves, programs, blinks
+        self.curve_start = halves(CURVES_MAX)
+        self.curve_samples = halves(CURVES_MAX)
+        self.samples_q15 = halves(CURVES_MAX * SAMPLES_MAX)
+        self.program_start = halves(isa.PROGRAMS_MAX)
+        self.program_words = halves(isa.PROGRAMS_MAX)
+        self.pool = words(isa.POOL_WORDS)
+        self.threshold_q16 = words(BLINKS_MAX)
+        self.gap_q18 = words(BLINKS_MAX)
 
-    def begin(self, frame_rate_hz, dofs, actions, mappings, lives, seed, spread_q15, hold_q26, link_timeout_ms):
+    # fmt: off
+    def begin(
+        self, frame_rate_hz, dofs, actions, mappings, lives, curves, programs, blinks, seed, spread_q15, hold_q26,
+        link_timeout_ms,
+    ):
+        # fmt: on
         """Empty the set and announce what will come."""
         self.ready = False
         for number, (value, least, most) in enumerate(
@@ -95,6 +125,9 @@ class Tables:
                 (actions, 0, ACTIONS_MAX),
                 (mappings, 0, MAPPINGS_MAX),
                 (lives, 0, LIVES_MAX),
+                (curves, 0, CURVES_MAX),
+                (programs, 0, isa.PROGRAMS_MAX),
+                (blinks, 0, BLINKS_MAX),
                 (seed, 0, 0xFFFFFFFF),
                 (spread_q15, 0, VALUE_ONE),
                 (hold_q26, 1, ALPHA_ONE - 1),
@@ -113,9 +146,17 @@ class Tables:
         for dof in range(DOFS_MAX):
             self.hold_q26[dof] = hold_q26
         self.link_timeout_ms = link_timeout_ms
-        self._dofs_seen = self._actions_seen = self._mappings_seen = self._lives_seen = 0
+        self.curves = curves
+        self.programs = programs
+        self.blinks = blinks
+        self._forget_seen()
         self.ready = True
         return None
+
+    def _forget_seen(self):
+        self._dofs_seen = self._actions_seen = self._mappings_seen = self._lives_seen = 0
+        self._curves_seen = self._programs_seen = self._blinks_seen = 0
+        self._samples_used = self._samples_end = self._words_used = self._words_end = 0
 
     def dof(self, dof, kind, rest_q15, low_q15, high_q15):
         """Store a DOF; it drives nothing until `output` gives it a pin."""
@@ -155,8 +196,8 @@ class Tables:
         self.pulse1_q4us[dof] = pulse1_q4us
         return None
 
-    def action(self, action, tempo_q16, rise_q26, fall_q26, first_mapping, mappings):
-        """Store an action; its mappings are `first_mapping` .. `first_mapping + mappings - 1`."""
+    def action(self, action, tempo_q16, rise_q26, fall_q26, first_mapping, mappings, entry, warp_q26, cycles):
+        """Store an action; its mappings are `first_mapping` .. `first_mapping + mappings - 1`, 0 cycles no gesture."""
         if action != self._actions_seen or action >= self.actions:
             return 0
         if not TEMPO_MIN_Q16 <= tempo_q16 <= TEMPO_MAX_Q16:
@@ -169,11 +210,20 @@ class Tables:
             return 4
         if mappings > DOFS_MAX:
             return 5
+        if entry > ENTRY_START:
+            return 6
+        if not 0 < warp_q26 < ALPHA_ONE:
+            return 7
+        if cycles > CYCLES_MAX or (cycles and entry != ENTRY_START):
+            return 8
         self.tempo_q16[action] = tempo_q16
         self.rise_q26[action] = rise_q26
         self.fall_q26[action] = fall_q26
         self.first_mapping[action] = first_mapping
         self.mapping_count[action] = mappings
+        self.entry[action] = entry
+        self.warp_q26[action] = warp_q26
+        self.cycles[action] = cycles
         self._actions_seen += 1
         return None
 
@@ -181,13 +231,9 @@ class Tables:
         """Store a mapping. The field numbers count from the item's `dof`, 0; a mapping out of its place is field 0."""
         if mapping != self._mappings_seen or mapping >= self.mappings or dof >= self.dofs:
             return 0
-        if function > FUNCTION_LIVE:
+        if function > FUNCTION_RTRIGSIN:
             return 1
-        if (
-            (function == FUNCTION_NOISE and argument >= NOISE_TABLES)
-            or (function == FUNCTION_CONST and argument > VALUE_ONE)
-            or (function == FUNCTION_LIVE and argument >= self.lives)
-        ):
+        if argument >= self._arguments(function):
             return 2
         if low_q15 > VALUE_ONE:
             return 3
@@ -200,6 +246,94 @@ class Tables:
         self.high_q15[mapping] = high_q15
         self._mappings_seen += 1
         return None
+
+    def _arguments(self, function):
+        """Return how many arguments a function may have."""
+        if function == FUNCTION_NOISE:
+            return NOISE_TABLES
+        if function == FUNCTION_CONST:
+            return VALUE_ONE + 1
+        if function == FUNCTION_LIVE:
+            return self.lives
+        if function == FUNCTION_CURVE:
+            return self.curves
+        if function == FUNCTION_PROGRAM:
+            return self.programs
+        if function >= FUNCTION_BLINK:
+            return self.blinks
+        return 0x10000
+
+    def curve(self, curve, samples):
+        """Begin a curve of so many samples, or go on with it; `sample` stores them, in order."""
+        if curve != self._curves_seen or curve >= self.curves:
+            return 0
+        if self._samples_used == self._samples_end:
+            if not 2 <= samples <= SAMPLES_MAX:
+                return 1
+            self.curve_start[curve] = self._samples_used
+            self.curve_samples[curve] = samples
+            self._samples_end = self._samples_used + samples
+        return None if samples == self.curve_samples[curve] else 1
+
+    def sample(self, value_q15):
+        """Store a sample of the curve under way; it is field 0."""
+        if value_q15 > VALUE_ONE or self._samples_used >= self._samples_end:
+            return 0
+        self.samples_q15[self._samples_used] = value_q15
+        self._samples_used += 1
+        if self._samples_used == self._samples_end:
+            self._curves_seen += 1
+        return None
+
+    def program(self, program, words):
+        """Begin a program of so many words, or go on with it; `word` stores them, in order."""
+        if program != self._programs_seen or program >= self.programs:
+            return 0
+        if self._words_used == self._words_end:
+            if not 1 <= words <= min(isa.WORDS_MAX, isa.POOL_WORDS - self._words_used):
+                return 1
+            self.program_start[program] = self._words_used
+            self.program_words[program] = words
+            self._words_end = self._words_used + words
+        return None if words == self.program_words[program] else 1
+
+    def word(self, word):
+        """Store a word of the program under way, and check the program with its last one; it is field 0."""
+        if self._words_used >= self._words_end:
+            return 0
+        self.pool[self._words_used] = word
+        self._words_used += 1
+        if self._words_used == self._words_end:
+            start = self.program_start[self._programs_seen]
+            if check_program(self.pool, start, self._words_end, self.curves, self.lives) is not None:
+                return 0
+            self._programs_seen += 1
+        return None
+
+    def blink(self, blink, threshold_q16, gap_q18):
+        """Store a blink's threshold and least gap."""
+        if blink != self._blinks_seen or blink >= self.blinks:
+            return 0
+        if threshold_q16 > 0x10000:
+            return 1
+        if gap_q18 > _GAP_MAX_Q18:
+            return 2
+        self.threshold_q16[blink] = threshold_q16
+        self.gap_q18[blink] = gap_q18
+        self._blinks_seen += 1
+        return None
+
+    def link_repeats(self):
+        """Note for every mapping which one before it in its action has the same function: that is evaluated once."""
+        for action in range(self.actions):
+            first = self.first_mapping[action]
+            for mapping in range(first, first + self.mapping_count[action]):
+                self.same[mapping] = mapping
+                function = self.function[mapping]
+                for other in range(first, mapping if function < FUNCTION_BLINK else first):
+                    if self.function[other] == function and self.argument[other] == self.argument[mapping]:
+                        self.same[mapping] = other
+                        break
 
     def live(self, live, rest_q28, rise_q26, fall_q26):
         """Store a live channel."""
@@ -236,4 +370,7 @@ class Tables:
             + (self.actions - self._actions_seen)
             + (self.mappings - self._mappings_seen)
             + (self.lives - self._lives_seen)
+            + (self.curves - self._curves_seen)
+            + (self.programs - self._programs_seen)
+            + (self.blinks - self._blinks_seen)
         )

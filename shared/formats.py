@@ -28,6 +28,9 @@ DOFS_MAX = 16
 ACTIONS_MAX = 64
 MAPPINGS_MAX = 512
 LIVES_MAX = 16
+CURVES_MAX = 16
+SAMPLES_MAX = 256  # of one curve
+BLINKS_MAX = 32
 QUEUE_MAX = 256  # stamped targets that wait for their frame
 NOISE_TABLES = 16
 GRADIENTS = 256  # per noise table
@@ -43,13 +46,22 @@ PULSE_MIN_US = 300
 PULSE_MAX_US = 3000
 SERVO_PERIOD_US = 20000
 
-# Function codes of a mapping. Its `argument` is, in this order: nothing, nothing, the table 0..15, a value_q15, a live
-# channel.
+# Function codes of a mapping. Its `argument` is, in this order: nothing, nothing, the noise table 0..15, a value_q15, a
+# live channel, a curve, a program, a blink, a blink.
 FUNCTION_RSIN = 0
 FUNCTION_RCOS = 1
 FUNCTION_NOISE = 2
 FUNCTION_CONST = 3
 FUNCTION_LIVE = 4
+FUNCTION_CURVE = 5
+FUNCTION_PROGRAM = 6
+FUNCTION_BLINK = 7
+FUNCTION_RTRIGSIN = 8
+
+# How an action enters: in step with the master clock, or at its own beginning.
+ENTRY_SYNC = 0
+ENTRY_START = 1
+CYCLES_MAX = 1000  # of a gesture
 
 # Kinds of DOF.
 KIND_ABSOLUTE = 0

@@ -20,7 +20,11 @@ OUTPUT = 0x14
 ACTION = 0x15
 MAPPINGS = 0x16
 LIVE = 0x17
-COMMIT = 0x18
+CURVE = 0x18
+PROGRAM = 0x19
+BLINK = 0x1A
+KEEP = 0x1B
+COMMIT = 0x1F
 START = 0x20
 STOP = 0x21
 WEIGHT_TARGETS = 0x22
@@ -50,6 +54,9 @@ MESSAGES = (
             ("actions", "B"),
             ("mappings", "H"),
             ("lives", "B"),
+            ("curves", "B"),
+            ("programs", "B"),
+            ("blinks", "B"),
             ("seed", "I"),
             ("noise_spread_q15", "H"),
             ("hold_q26", "I"),
@@ -69,6 +76,9 @@ MESSAGES = (
             ("fall_q26", "I"),
             ("first_mapping", "H"),
             ("mappings", "B"),
+            ("entry", "B"),
+            ("warp_q26", "I"),
+            ("cycles", "H"),
         ),
         (),
     ),
@@ -79,6 +89,10 @@ MESSAGES = (
         (("dof", "B"), ("function", "B"), ("argument", "H"), ("low_q15", "H"), ("high_q15", "H")),
     ),
     ("live", LIVE, (("live", "B"), ("rest_q28", "I"), ("rise_q26", "I"), ("fall_q26", "I")), ()),
+    ("curve", CURVE, (("curve", "B"), ("samples", "H")), (("value_q15", "H"),)),
+    ("program", PROGRAM, (("program", "B"), ("words", "H")), (("word", "i"),)),
+    ("blink", BLINK, (("blink", "B"), ("threshold_q16", "I"), ("gap_q18", "I")), ()),
+    ("keep", KEEP, (("kind", "B"), ("first", "B")), (("old", "B"),)),
     ("commit", COMMIT, (), ()),
     # --- to the MCU: the performance
     ("start", START, (), ()),
