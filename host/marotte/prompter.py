@@ -23,7 +23,7 @@ class Directed(Protocol):
 
     def weight_targets(self, frame: int, targets_q28: dict[int, int]) -> None: ...
     def live_targets(self, frame: int, targets_q28: dict[int, int]) -> None: ...
-    def tempo(self, frame: int, tempo_q16: int) -> None: ...
+    def tempo(self, frame: int, action: int, tempo_q16: int) -> None: ...
 
 
 class Prompter:
@@ -65,8 +65,10 @@ class Prompter:
         if step.lives:
             self._session.live_targets(step.frame, {live: weight_q28(target) for live, target in step.lives.items()})
         if step.master_tempo is not None:
-            self._session.tempo(step.frame, tempo_q16(step.master_tempo))
+            self._session.tempo(step.frame, formats.MASTER, tempo_q16(step.master_tempo))
+        for action, tempo in step.tempos.items():
+            self._session.tempo(step.frame, action, tempo_q16(tempo))
 
 
 def _targets(step: Step) -> int:
-    return len(step.weights) + len(step.lives) + (step.master_tempo is not None)
+    return len(step.weights) + len(step.lives) + len(step.tempos) + (step.master_tempo is not None)

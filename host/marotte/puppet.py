@@ -69,8 +69,11 @@ class Action:
     tau_s: tuple[float, float] = (0.25, 0.25)
     """Time constants of a rising and of a falling weight."""
     entry: str = "sync"
+    """`sync`: in step with the master phase; `start`: its own time begins as it enters."""
     warp_s: float = 0.5
+    """Time constant with which it falls in with the master phase."""
     cycles: int | None = None
+    """The periods of a gesture, after which it ends by itself; None if it is none."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,8 @@ class Curve:
     """A `[function.NAME]`: an expression, or the samples of one period."""
 
     name: str
+    function: Function
+    """What its bare name means as the FUNCTION of a mapping."""
     expression: str | None = None
     samples: tuple[float, ...] = ()
 
@@ -115,7 +120,7 @@ class Puppet:
     dofs: Mapping[str, Dof] = field(default_factory=dict)
     actions: Mapping[str, Action] = field(default_factory=dict)
     lives: Mapping[str, Live] = field(default_factory=dict)
-    """The channels declared, then those that mappings use without declaring them."""
+    """The channels declared, then those that functions and mappings use without declaring them."""
     functions: Mapping[str, Curve] = field(default_factory=dict)
     behaviours: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Weight targets by action."""

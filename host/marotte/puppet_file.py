@@ -5,12 +5,13 @@ Source: docs/puppet-file.md; each value's range is checked where it is read.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from marotte import functions
 from marotte.functions import Function, FunctionError
+from marotte.pools import Pools
 from marotte.positions import KeyPath
 from marotte.puppet import (
     ABSOLUTE,
@@ -26,7 +27,7 @@ from marotte.puppet import (
     Puppet,
 )
 from marotte.tomlfile import Document, FileMistakes, Mistake, Table, check_number, did_you_mean, found, is_identifier
-from shared import formats
+from shared import formats, program
 
 TEMPO_RANGE = (0.05, 8)
 MASTER_TEMPO_RANGE = (0.25, 4)
@@ -34,8 +35,8 @@ WEIGHT_RANGE = (0, 4)
 GAIN_RANGE = (-4, 4)
 TAU_RANGE_S = (0.03, 10)
 WARP_RANGE_S = (0.05, 10)
-CYCLES_RANGE = (1, 1000)
-SAMPLES_RANGE = (2, 256)
+CYCLES_RANGE = (1, formats.CYCLES_MAX)
+SAMPLES_RANGE = (2, formats.SAMPLES_MAX)
 SEED_MAX = 2**32 - 1
 MASTER_NAME = "global"
 """What a score's tempo table calls the master tempo; no action can have this name."""
@@ -84,7 +85,9 @@ class _Reader:
     def __init__(self, document: Document) -> None:
         self.document = document
         self.root = document.root()
-        self.function_names: Sequence[str] = ()
+        self.functions: dict[str, Function] = {}
+        self.parsed: dict[str | None, Function | FunctionError] = {}
+        self.blinking: set[object] = set()
         self.dofs: dict[str, Dof] = {}
         self.lives: dict[str, Live] = {}
         self.mapping_count = 0
@@ -98,16 +101,18 @@ class _Reader:
         when_silent = root.choice("when_silent", ("idle", "rest", "relax"), "idle")
         if when_silent != "idle":
             root.not_yet("when_silent", "when_silent")
-        curves = {name: self.curve(name, table) for name, table in root.tables("function")}
-        self.function_names = list(curves)
+        curves = self.curves()
+        self.blinking = self.blinking_dofs()
         dofs = {name: self.dof(table, name) for name, table in root.tables("dof")}
         self.dofs = dofs
         self.lives = {name: self.live(table, name) for name, table in root.tables("live")}
+        for function in self.functions.values():
+            self.declare_channels(function)
         actions = {name: self.action(table, name) for name, table in root.tables("action")}
         behaviours = {name: weights(table, actions) for name, table in root.tables("behaviour")}
         moods = {name: self.mood(table, name) for name, table in root.tables("mood")}
         root.finish()
-        self.check_counts(dofs, actions)
+        self.check_counts(dofs, actions, curves)
         return Puppet(
             name,
             frame_rate_hz,
@@ -136,7 +141,7 @@ class _Reader:
         if limits and limits[0] >= limits[1]:
             table.mistake(f"found {found(table.value('limits'))}, expected the least value first", "limits")
         signal = table.boolean("signal", default=None)
-        blinks = self.maps_blink(name)
+        blinks = name in self.blinking
         if signal and blinks:
             table.mistake("found true, expected false: a DOF that blinks has no future to be known", "signal")
         character = self.character(table) if table.has("character") else None
@@ -144,13 +149,14 @@ class _Reader:
         is_processed = signal if signal is not None else not (relative or blinks)
         return Dof(name, kind, rest, (limits[0], limits[1]) if limits else (low, high), is_processed, character)
 
-    def maps_blink(self, dof: str) -> bool:
-        """Return whether any mapping of the DOF, in any action, blinks."""
+    def blinking_dofs(self) -> set[object]:
+        """Return the names of the DOFs that any mapping, in any action, makes blink."""
         actions = self.root.value("action", {})
         tables = [table for table in actions.values() if isinstance(table, dict)] if isinstance(actions, dict) else []
         maps = [table["map"] for table in tables if isinstance(table.get("map"), list)]
-        rows = [row for rows in maps for row in rows if isinstance(row, list) and len(row) == 4 and row[0] == dof]
-        return any(isinstance(row[3], str) and row[3].strip().startswith(tuple(functions.BLINKS)) for row in rows)
+        rows = [row for rows in maps for row in rows if isinstance(row, list) and len(row) == 4]
+        parsed = [(dof, self.parse(text)) for dof, _, _, text in rows if isinstance(dof, str)]
+        return {dof for dof, function in parsed if isinstance(function, Function) and function.blinks}
 
     def character(self, table: Table) -> Character:
         table.not_yet("character", "character")
@@ -162,21 +168,33 @@ class _Reader:
         inner.finish()
         return character
 
+    def curves(self) -> dict[str, Curve]:
+        """Return the `[function.NAME]`s in the file's order; tables are read first, as expressions may name them."""
+        tables = dict(self.root.tables("function"))
+        curves = {}
+        for name in sorted(tables, key=lambda name: tables[name].has("expr")):
+            curves[name] = self.curve(name, tables[name])
+            self.functions[name] = curves[name].function
+        return {name: curves[name] for name in tables}
+
     def curve(self, name: str, table: Table) -> Curve:
-        table.document.not_yet(table.path, "function")
         if name in functions.PRIMITIVES or name == "t":
             table.mistake(f'"{name}" is the name of a primitive; expected another name')
         elif not is_identifier(name):
             table.mistake("expected a name of letters, digits and _, as it stands in expressions")
         expression = table.text("expr", "") if table.has("expr") else None
-        if expression is not None:
-            _checked(table, expression)
         samples = self.samples(table) if table.has("table") else ()
+        function = Function("curve", (name,)) if table.has("table") else Function("const", (0.0,))
+        if isinstance(table.value("expr"), str):
+            try:
+                function = functions.parse_expression(table.value("expr"), self.functions)
+            except FunctionError as error:
+                table.mistake(f"found {found(table.value('expr'))}: {error}", "expr")
         if table.has("expr") == table.has("table"):
             what = "both" if table.has("expr") else "neither"
             table.mistake(f'has {what}, expected one of "expr" and "table"')
         table.finish()
-        return Curve(name, expression, samples)
+        return Curve(name, function, expression, samples)
 
     def samples(self, table: Table) -> tuple[float, ...]:
         values = table.array("table", "an array of samples in 0..1") or []
@@ -204,16 +222,10 @@ class _Reader:
         tempo = table.number("tempo", *TEMPO_RANGE, default=1.0)
         tau_s = _tau(table, Action.tau_s)
         entry = table.choice("entry", ("sync", "start"), "sync")
-        if entry == "start":
-            table.not_yet("entry", "entry")
         warp_s = table.number("warp", *WARP_RANGE_S, default=Action.warp_s)
-        if table.has("warp"):
-            table.not_yet("warp", "warp")
         cycles = table.integer("cycles", *CYCLES_RANGE, default=1) if table.has("cycles") else None
-        if cycles is not None:
-            table.not_yet("cycles", "cycles")
-            if table.value("entry", "sync") == "sync":
-                table.mistake('only an action with entry = "start" has cycles', "cycles")
+        if cycles is not None and table.value("entry", "sync") == "sync":
+            table.mistake('only an action with entry = "start" has cycles', "cycles")
         table.require("map", f'map = [ ["DOF", LOW, HIGH, "FUNCTION"], ... ], {_MAPPING} for each DOF it moves')
         mappings = self.mappings(table)
         table.finish()
@@ -250,15 +262,27 @@ class _Reader:
         return MappingEntry(dof, float(low), float(high), function) if known and all(good) and function else None
 
     def function(self, path: KeyPath, text: Any) -> Function | None:
-        try:
-            function = functions.parse_function(text, self.function_names)
-        except FunctionError as error:
-            self.document.mistake((*path, 3), f"found {found(text)}: {error}")
+        function = self.parse(text)
+        if isinstance(function, FunctionError):
+            self.document.mistake((*path, 3), f"found {found(text)}: {function}")
             return None
-        if function.kind == "live":
-            self.lives.setdefault(str(function.arguments[0]), Live(str(function.arguments[0])))
-        self.document.not_yet((*path, 3), function.kind)
+        self.declare_channels(function)
         return function
+
+    def parse(self, text: Any) -> Function | FunctionError:
+        """Return what a FUNCTION means, or what is wrong with it; each text is parsed once."""
+        key = text if isinstance(text, str) else None
+        if key not in self.parsed:
+            try:
+                self.parsed[key] = functions.parse_function(text, self.functions)
+            except FunctionError as error:
+                self.parsed[key] = error
+        return self.parsed[key]
+
+    def declare_channels(self, function: Function) -> None:
+        """Note the live channels that a function reads without their being declared."""
+        for name in function.channels:
+            self.lives.setdefault(name, Live(name))
 
     def mood(self, table: Table, name: str) -> Mood:
         tempo = table.number("tempo", *MASTER_TEMPO_RANGE, default=1.0) if table.has("tempo") else None
@@ -266,24 +290,26 @@ class _Reader:
         table.finish()
         return mood
 
-    def check_counts(self, dofs: dict[str, Dof], actions: dict[str, Action]) -> None:
+    def check_counts(self, dofs: dict[str, Dof], actions: dict[str, Action], curves: dict[str, Curve]) -> None:
         if not dofs:
             self.root.mistake("has no DOF, expected at least one [dof.NAME]")
-        for what, count, most in (
-            ("DOFs", len(dofs), formats.DOFS_MAX),
-            ("actions", len(actions), formats.ACTIONS_MAX),
-            ("mappings", self.mapping_count, formats.MAPPINGS_MAX),
-            ("live channels", len(self.lives), formats.LIVES_MAX),
+        pools = Pools(curves, list(self.lives))
+        for action in actions.values():
+            for entry in action.mappings:
+                pools.code(entry.function)
+        words = sum(map(len, pools.programs))
+        for key, what, count, most in (
+            ("dof", "DOFs", len(dofs), formats.DOFS_MAX),
+            ("action", "actions", len(actions), formats.ACTIONS_MAX),
+            ("action", "mappings", self.mapping_count, formats.MAPPINGS_MAX),
+            ("live", "live channels", len(self.lives), formats.LIVES_MAX),
+            ("function", "different tables in use", len(pools.curves), formats.CURVES_MAX),
+            ("action", "different expressions", len(pools.programs), program.PROGRAMS_MAX),
+            ("action", "words of compiled expressions", words, program.POOL_WORDS),
+            ("action", "different pairs of threshold and least gap of blinks", len(pools.blinks), formats.BLINKS_MAX),
         ):
             if count > most:
-                self.root.mistake(f"has {count} {what}, expected at most {most}")
-
-
-def _checked(table: Table, expression: str) -> None:
-    try:
-        functions.check_expression(expression)
-    except FunctionError as error:
-        table.mistake(f"found {found(expression)}: {error}", "expr")
+                self.root.mistake(f"has {count} {what}, expected at most {most}", key)
 
 
 def _tau(table: Table, default: tuple[float, float]) -> tuple[float, float]:

@@ -64,6 +64,8 @@ class Step:
     lives: Mapping[int, float]
     """Live targets 0..1 by the channel's index."""
     master_tempo: float | None
+    tempos: Mapping[int, float] = field(default_factory=dict)
+    """Tempos 0.05..8 by the action's index."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,6 @@ def _tempos(table: Table, puppet: Puppet) -> tuple[dict[str, float], float | Non
             master_tempo = table.number(name, *MASTER_TEMPO_RANGE, default=1)
         elif name in puppet.actions:
             tempos[name] = table.number(name, *TEMPO_RANGE, default=1)
-            table.not_yet(name, "action_tempo")
         else:
             table.mistake(f"unknown action{did_you_mean(name, [MASTER_NAME, *puppet.actions])}", name)
     return tempos, master_tempo
@@ -164,6 +165,7 @@ def _step(puppet: Puppet, frame: int, cues: list[Cue], targets: dict[str, float]
     """Return the step of one frame; `targets` holds the weight targets as the score has set them so far, and is kept up."""
     changed: dict[str, float] = {}
     lives: dict[str, float] = {}
+    tempos: dict[str, float] = {}
     master_tempo = None
     for cue in cues:
         if cue.behaviour is not None:
@@ -173,6 +175,7 @@ def _step(puppet: Puppet, frame: int, cues: list[Cue], targets: dict[str, float]
         if cue.mood is not None and puppet.moods[cue.mood].tempo is not None:
             master_tempo = puppet.moods[cue.mood].tempo
         lives.update(cue.lives)
+        tempos.update(cue.tempos)
         master_tempo = cue.master_tempo if cue.master_tempo is not None else master_tempo
     targets.update(changed)
     return Step(
@@ -180,4 +183,5 @@ def _step(puppet: Puppet, frame: int, cues: list[Cue], targets: dict[str, float]
         {puppet.action_index(name): target for name, target in changed.items()},
         {puppet.live_index(name): target for name, target in lives.items()},
         master_tempo,
+        {puppet.action_index(name): tempo for name, tempo in tempos.items()},
     )

@@ -16,7 +16,6 @@ from collections.abc import Callable
 from marotte.link import Carrier, Link, LinkError, LinkSilent, Message
 from marotte.tables import Tables, items_per_message
 from shared import codec, messages
-from shared.formats import MASTER
 
 OPEN_TIMEOUT_S = 1.5
 UPLOAD_TIMEOUT_S = 5.0
@@ -118,9 +117,11 @@ class Session:
         items = [{"live": live, "target_q28": target} for live, target in targets_q28.items()]
         self._post_items("live_targets", frame, items, on_refused)
 
-    def tempo(self, frame: int, tempo_q16: int, on_refused: Callable[[int, int], None] | None = None) -> None:
-        """Set the master tempo, from `frame` on or at once (FRAME_NOW)."""
-        self._post_items("tempo", frame, [{"action": MASTER, "tempo_q16": tempo_q16}], on_refused)
+    def tempo(
+        self, frame: int, action: int, tempo_q16: int, on_refused: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Set the tempo of an action by its index, or of all (MASTER), from `frame` on or at once (FRAME_NOW)."""
+        self._post_items("tempo", frame, [{"action": action, "tempo_q16": tempo_q16}], on_refused)
 
     def telemetry(self, taps: int, taps_every: int, weights_every: int) -> None:
         """Ask for taps (bits of TAP_BASE, TAP_SIGNAL, TAP_MOTOR) and weights, every so many frames; 0 is never."""

@@ -5,14 +5,6 @@ a file is ever ignored silently. Performing a feature means deleting its entry h
 """
 
 NOT_YET = {
-    "blink": 'the function "blink"',
-    "rtrigsin": 'the function "rtrigsin"',
-    "expression": "an expression",
-    "function": "a custom function",
-    "entry": 'entry = "start"',
-    "cycles": "a gesture",
-    "warp": "tempo warping",
-    "action_tempo": "a tempo cue for a single action",
     "gains": "a band gain other than 1",
     "kalman": 'predict = "kalman"',
     "character": "character",

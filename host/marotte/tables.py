@@ -11,11 +11,12 @@ becomes 0, as that would end the action instead of making it faint.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
-from marotte.functions import Function
+from marotte.fixed import fixed
+from marotte.pools import Pools
 from marotte.puppet import Action, Dof, MappingEntry, Puppet
 from marotte.wiring import Robot
 from shared import codec, formats, messages
@@ -39,8 +40,9 @@ class Tables:
     def messages(self) -> Iterator[Message]:
         """Yield the upload's messages in their order, `begin` first and `commit` last."""
         puppet = self.puppet
-        mappings = [entry for action in puppet.actions.values() for entry in action.mappings]
-        yield "begin", self._begin(len(mappings)), []
+        pools = Pools(puppet.functions, list(puppet.lives))
+        mappings = [self._mapping(entry, pools) for action in puppet.actions.values() for entry in action.mappings]
+        yield "begin", self._begin(len(mappings), pools), []
         for index, dof in enumerate(puppet.dofs.values()):
             yield "dof", _dof(index, dof), []
         for index, name in enumerate(puppet.dofs):
@@ -50,16 +52,21 @@ class Tables:
         for index, action in enumerate(puppet.actions.values()):
             yield "action", self._action(index, action, first), []
             first += len(action.mappings)
-        items = [self._mapping(entry) for entry in mappings]
         step = items_per_message("mappings")
-        for start in range(0, len(items), step):
-            yield "mappings", {"first_mapping": start}, items[start : start + step]
+        for start in range(0, len(mappings), step):
+            yield "mappings", {"first_mapping": start}, mappings[start : start + step]
         for index, live in enumerate(puppet.lives.values()):
             rise, fall = (alpha_q26(tau_s, puppet.frame_rate_hz) for tau_s in live.tau_s)
             yield "live", {"live": index, "rest_q28": weight_q28(live.rest), "rise_q26": rise, "fall_q26": fall}, []
+        for index, samples_q15 in enumerate(pools.curves):
+            yield from _in_parts("curve", {"curve": index, "samples": len(samples_q15)}, "value_q15", samples_q15)
+        for index, words in enumerate(pools.programs):
+            yield from _in_parts("program", {"program": index, "words": len(words)}, "word", words)
+        for index, (threshold_q16, gap_q18) in enumerate(pools.blinks):
+            yield "blink", {"blink": index, "threshold_q16": threshold_q16, "gap_q18": gap_q18}, []
         yield "commit", {}, []
 
-    def _begin(self, mappings: int) -> dict[str, int]:
+    def _begin(self, mappings: int, pools: Pools) -> dict[str, int]:
         puppet = self.puppet
         return {
             "frame_rate_hz": puppet.frame_rate_hz,
@@ -67,6 +74,9 @@ class Tables:
             "actions": len(puppet.actions),
             "mappings": mappings,
             "lives": len(puppet.lives),
+            "curves": len(pools.curves),
+            "programs": len(pools.programs),
+            "blinks": len(pools.blinks),
             "seed": puppet.seed,
             "noise_spread_q15": fixed(puppet.noise_spread, formats.VALUE_BITS),
             "hold_q26": alpha_q26(HOLD_TAU_S, puppet.frame_rate_hz),
@@ -87,10 +97,13 @@ class Tables:
             "fall_q26": fall,
             "first_mapping": first_mapping,
             "mappings": len(action.mappings),
+            "entry": formats.ENTRY_START if action.entry == "start" else formats.ENTRY_SYNC,
+            "warp_q26": alpha_q26(action.warp_s, self.puppet.frame_rate_hz),
+            "cycles": action.cycles or 0,
         }
 
-    def _mapping(self, entry: MappingEntry) -> dict[str, int]:
-        code, argument = self._function(entry.function)
+    def _mapping(self, entry: MappingEntry, pools: Pools) -> dict[str, int]:
+        code, argument = pools.code(entry.function)
         dof = self.puppet.dofs[entry.dof]
         return {
             "dof": list(self.puppet.dofs).index(entry.dof),
@@ -100,30 +113,10 @@ class Tables:
             "high_q15": value_q15(entry.high, dof),
         }
 
-    def _function(self, function: Function) -> tuple[int, int]:
-        argument: Any = function.arguments[0] if function.arguments else 0
-        match function.kind:
-            case "rsin":
-                return formats.FUNCTION_RSIN, 0
-            case "rcos":
-                return formats.FUNCTION_RCOS, 0
-            case "noise":
-                return formats.FUNCTION_NOISE, argument - 1
-            case "const":
-                return formats.FUNCTION_CONST, fixed(argument, formats.VALUE_BITS)
-            case "live":
-                return formats.FUNCTION_LIVE, self.puppet.live_index(argument)
-        raise ValueError(f"the function {function} has no code on the wire")
-
 
 def build_tables(puppet: Puppet, robot: Robot | None = None) -> Tables:
     """Return the tables of a puppet; without a robot it drives no pin."""
     return Tables(puppet, robot or Robot())
-
-
-def fixed(value: float, bits: int) -> int:
-    """Return `value` with `bits` binary places, rounded to nearest, halves up."""
-    return math.floor(math.ldexp(value, bits) + 0.5)
 
 
 def value_q15(value: float, dof: Dof) -> int:
@@ -156,6 +149,13 @@ def items_per_message(name: str) -> int:
     """Return how many items a message of this name has room for."""
     fields, items = _MESSAGES[name]
     return (codec.PAYLOAD_MAX - messages.size(fields)) // messages.size(items)
+
+
+def _in_parts(name: str, fields: dict[str, int], item: str, values: Sequence[int]) -> Iterator[Message]:
+    """Yield as many messages of this name as the values need, in order; `item` is the field of an item."""
+    step = items_per_message(name)
+    for start in range(0, len(values), step):
+        yield name, fields, [{item: value} for value in values[start : start + step]]
 
 
 def _dof(index: int, dof: Dof) -> dict[str, int]:

@@ -50,7 +50,7 @@ def begin_performance(mcu, taps=ALL_TAPS) -> Session:
     session.telemetry(taps, 1, 0)
     session.weight_targets(0, {0: formats.WEIGHT_ONE, 1: formats.WEIGHT_ONE // 2, 2: 3 * formats.WEIGHT_ONE})
     session.weight_targets(25, {0: 0, 3: formats.WEIGHT_ONE})
-    session.tempo(40, formats.TEMPO_ONE * 3 // 2)
+    session.tempo(40, formats.MASTER, formats.TEMPO_ONE * 3 // 2)
     session.start()
     session.flush()
     return session

@@ -114,15 +114,17 @@ def test_score_cues_of_one_frame_act_in_order_of_time_then_file(tmp_path, puppet
     [[cue]]
     at = 0.95
     behaviour = "AB"
-    tempo = { global = 4 }
+    tempo = { global = 4, A = 3, B = 0.5 }
     [[cue]]
     at = 0.98
     live = { GAZE = 0.9 }
     mood = "FAST"
+    tempo = { A = 7 }
     """
     steps = steps_of(tmp_path, puppet, text)
     assert list(steps) == [10]
     assert (steps[10].weights, steps[10].lives, steps[10].master_tempo) == ({0: 3.0, 1: 1.0}, {0: 0.9}, 2.0)
+    assert steps[10].tempos == {0: 7.0, 1: 0.5}
 
 
 def test_score_within_a_cue_behaviour_comes_first_and_tempo_last(tmp_path, puppet):
@@ -199,9 +201,9 @@ def test_score_reports_all_mistakes(tmp_path, puppet):
     assert len(mistakes_of(tmp_path, puppet, text)) == 5
 
 
-@pytest.mark.parametrize(("text", "feature"), [("tempo={A=2}", "action_tempo"), ("gains=[2,1,1,1,1,1,1]", "gains")])
+@pytest.mark.parametrize(("text", "feature"), [("gains=[2,1,1,1,1,1,1]", "gains")])
 def test_score_says_what_this_version_does_not_perform(tmp_path, puppet, text, feature):
-    expected = [f"{NOT_YET[feature]} is not supported by this version"] if feature in NOT_YET else []
+    expected = [f"{NOT_YET[feature]} is not supported by this version"]
     found = mistakes_of(tmp_path, puppet, f"[[cue]]\nat=0\n{text}\n")
     assert [line.split(": ", 1)[1] for line in found] == expected
 

@@ -22,7 +22,7 @@ from marotte.tables import (
     weight_q28,
 )
 from marotte.wiring import load_robot
-from shared import codec, formats, messages
+from shared import codec, formats, messages, program
 
 PUPPETS = Path(__file__).parents[2] / "puppets"
 ABSOLUTE = Dof("A")
@@ -117,6 +117,85 @@ def test_tables_tempos_and_filters(tmp_path):
     (gaze, _), (late, _) = messages_named(tables, "live")
     assert (gaze["rest_q28"], late["rest_q28"]) == (1 << 28, 1 << 27)
     assert late["rise_q26"] == late["fall_q26"] == gaze["rise_q26"] > gaze["fall_q26"]
+
+
+FUNCTIONS = """
+frame_rate = 25
+[dof.A]
+[dof.B]
+[dof.C]
+[function.SAME_SHAPE]
+table = [0, 1, 0.25]
+[function.UNUSED]
+table = [0, 0.1]
+[function.SHAPE]
+table = [0.0, 1.0, 0.25]
+[function.LONG]
+table = [SAMPLES]
+[function.SUM]
+expr = "0.5*table(LONG, 2*t) + live(X)/4"
+[action.NOD]
+entry = "start"
+warp = 0.75
+cycles = 3
+map = [["A", 0, 1, "SHAPE"], ["B", 0, 1, "SUM"], ["C", 0, 1, "blink(0.93, 1.2)"]]
+[action.AGAIN]
+map = [["A", 0, 1, "SAME_SHAPE"], ["B", 0, 1, "0.5*table(LONG, t*2) + 0.25*live(X)"], ["C", 0, 1, "rtrigsin(0.93, 1.2)"]]
+[action.MORE]
+map = [["A", 0, 1, "table(LONG)"], ["B", 0, 1, "const(1)"], ["C", 0, 1, "blink"]]
+"""
+
+
+@pytest.fixture
+def function_tables(tmp_path):
+    (tmp_path / "p.toml").write_text(FUNCTIONS.replace("SAMPLES", ", ".join(f"{i / 255:.6f}" for i in range(256))))
+    return build_tables(load_puppet(tmp_path / "p.toml"))
+
+
+def test_tables_share_equal_functions(function_tables):
+    items = [item for _, items in messages_named(function_tables, "mappings") for item in items]
+    assert [(item["function"], item["argument"]) for item in items] == [
+        (formats.FUNCTION_CURVE, 0),
+        (formats.FUNCTION_PROGRAM, 0),
+        (formats.FUNCTION_BLINK, 0),
+        (formats.FUNCTION_CURVE, 0),
+        (formats.FUNCTION_PROGRAM, 0),
+        (formats.FUNCTION_RTRIGSIN, 0),
+        (formats.FUNCTION_CURVE, 1),
+        (formats.FUNCTION_CONST, 32768),
+        (formats.FUNCTION_BLINK, 1),
+    ]
+    ((begin, _),) = messages_named(function_tables, "begin")
+    assert (begin["curves"], begin["programs"], begin["blinks"]) == (2, 1, 2)
+
+
+def test_tables_long_curves_come_in_parts(function_tables):
+    curves = messages_named(function_tables, "curve")
+    assert [(fields["curve"], fields["samples"]) for fields, _ in curves] == [(0, 3), (1, 256), (1, 256), (1, 256)]
+    assert [item["value_q15"] for item in curves[0][1]] == [0, 32768, 8192]
+    samples_q15 = [item["value_q15"] for _, items in curves[1:] for item in items]
+    assert samples_q15 == [fixed(float(f"{i / 255:.6f}"), 15) for i in range(256)]
+    for fields, items in curves:
+        assert len(pack("curve", fields, items)) <= codec.PAYLOAD_MAX
+
+
+def test_tables_programs_have_indices_for_names(function_tables):
+    ((fields, items),) = messages_named(function_tables, "program")
+    words = [item["word"] for item in items]
+    assert fields == {"program": 0, "words": len(words)}
+    half, quarter = (program.SCALE, 1 << 19, 20), (program.SCALE, 1 << 19, 21)
+    assert words == [program.CURVE, 1, 32, 0, *half, program.LIVE, 0, *quarter, program.ADD]
+
+
+def test_tables_blinks_and_gestures(function_tables):
+    assert [fields for fields, _ in messages_named(function_tables, "blink")] == [
+        {"blink": 0, "threshold_q16": 60948, "gap_q18": 314573},
+        {"blink": 1, "threshold_q16": 64225, "gap_q18": 524288},
+    ]
+    nod, again, _ = (fields for fields, _ in messages_named(function_tables, "action"))
+    assert (nod["entry"], nod["cycles"], again["entry"], again["cycles"]) == (1, 3, 0, 0)
+    assert nod["warp_q26"] == round((1 - math.exp(-1 / (25 * 0.75))) * 2**26)
+    assert again["warp_q26"] == round((1 - math.exp(-1 / (25 * 0.5))) * 2**26)
 
 
 def test_tables_outputs_have_trim_and_inversion(tmp_path):
