@@ -37,8 +37,7 @@ def random_expression(rng, tables, channels, depth=3):
 
 def random_phase(rng):
     """Return a text of the form `a*t + b`."""
-    a = rng.choice((1, 2, -1, 3, 0.25, 16, rng.randint(-256, 256))) / rng.choice((1, 16))
-    a = a if abs(a) <= 16 else a / 16
+    a = rng.choice((1, 2, -1, 3, 4, 16, 32, -16, 48, 256, rng.randint(-256, 256))) / 16
     times = rng.choice((f"{a:.10g}*t", f"t*{a:.10g}", f"t/{rng.choice((2, 4, 8, 16))}", "t", "-t"))
     b = rng.choice((0.25, 0.5, 1, round(rng.uniform(0, 4), 4)))
     return rng.choice((times, times, f"{times} + {b}", f"{times} - {b}", f"{b} + {times}"))
