@@ -34,6 +34,7 @@ from shared.formats import (
     PULSE_MAX_US,
     PULSE_MIN_US,
     SAMPLES_MAX,
+    SAMPLES_POOL,
     TEMPO_MAX_Q16,
     TEMPO_MIN_Q16,
     VALUE_ONE,
@@ -103,7 +104,7 @@ class Tables:
         # curves, programs, blinks
         self.curve_start = halves(CURVES_MAX)
         self.curve_samples = halves(CURVES_MAX)
-        self.samples_q15 = halves(CURVES_MAX * SAMPLES_MAX)
+        self.samples_q15 = halves(SAMPLES_POOL)
         self.program_start = halves(isa.PROGRAMS_MAX)
         self.program_words = halves(isa.PROGRAMS_MAX)
         self.pool = words(isa.POOL_WORDS)
@@ -268,7 +269,7 @@ class Tables:
         if curve != self._curves_seen or curve >= self.curves:
             return 0
         if self._samples_used == self._samples_end:
-            if not 2 <= samples <= SAMPLES_MAX:
+            if not 2 <= samples <= min(SAMPLES_MAX, SAMPLES_POOL - self._samples_used):
                 return 1
             self.curve_start[curve] = self._samples_used
             self.curve_samples[curve] = samples

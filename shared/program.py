@@ -36,5 +36,5 @@ SHIFT_MAX = 40
 
 DEPTH_MAX = 16
 WORDS_MAX = 128  # of one program
-POOL_WORDS = 1024  # of all programs of a puppet
-PROGRAMS_MAX = 64
+POOL_WORDS = 4096  # of all programs of a puppet
+PROGRAMS_MAX = 255
