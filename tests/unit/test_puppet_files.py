@@ -373,7 +373,12 @@ CURVES, SAMPLES, PROGRAMS, WORDS, BLINKS = (
             SAMPLES,
             "samples of different tables in use",
         ),
-        (lambda n: mapped([f"rsin(t + {i}/512)" for i in range(n)]), PROGRAMS, PROGRAMS, "different expressions"),
+        (
+            lambda n: mapped([f"rsin(t + {i}/512)" for i in range(1, n + 1)]),
+            PROGRAMS,
+            PROGRAMS,
+            "different expressions",
+        ),
         (
             lambda n: mapped([f"{LONG} + {i / 1000}" for i in range(1, n + 1)]),
             WORDS,
