@@ -17,6 +17,7 @@ from rich.console import Console
 
 from marotte import check, commands, emulated
 from marotte.errors import MarotteError
+from marotte.files import Watch, load
 from marotte.tomlfile import FileMistakes
 
 FINE = 0
@@ -119,6 +120,7 @@ def _add_run(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         "marotte run puppets/pet.toml --score puppets/pet-score.toml --mcu rp2040",
         "marotte run puppets/pet.toml --score puppets/pet-score.toml --port /dev/ttyACM0 \\",
         "    --robot puppets/pet-robot.toml --arm",
+        "marotte run puppets/pet.toml --score puppets/pet-score.toml --mcu unix --watch",
     )
     _add_files(parser)
     where = parser.add_mutually_exclusive_group(required=True)
@@ -126,6 +128,9 @@ def _add_run(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     where.add_argument("--mcu", choices=emulated.KINDS, help="an emulated MCU, run in real time")
     parser.add_argument("--arm", action="store_true", help="let the robot's outputs give pulses: it moves")
     parser.add_argument("--seconds", type=_seconds, help="stop after so long (default: 2 s after the last cue)")
+    parser.add_argument(
+        "--watch", action="store_true", help="load the files again when they change, and play on with them"
+    )
     parser.add_argument("--no-view", action="store_true", help="print a line a cue instead of the moving picture")
 
 
@@ -186,7 +191,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _render(options: argparse.Namespace) -> int:
-    files = commands.load(options.puppet, options.score, options.robot)
+    files = load(options.puppet, options.score, options.robot)
     commands.render_to_csv(files, options.seconds, options.mcu, Path(options.out), Console(stderr=True))
     return FINE
 
@@ -194,12 +199,15 @@ def _render(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     if options.arm and not options.robot:
         return _failed("marotte: --arm needs --robot FILE, which says where the outputs are", MISTAKE)
-    files = commands.load(options.puppet, options.score, options.robot)
+    paths = (options.puppet, options.score, options.robot)
+    watch = Watch(*paths) if options.watch else None
+    files = load(*paths)
     console = Console()
+    how = commands.RunOptions(options.arm, options.seconds, options.no_view, watch)
     if options.port:
-        interrupted = commands.run_on_port(files, options.port, options.arm, options.seconds, options.no_view, console)
+        interrupted = commands.run_on_port(files, options.port, how, console)
     else:
-        interrupted = commands.run_on_mcu(files, options.mcu, options.arm, options.seconds, options.no_view, console)
+        interrupted = commands.run_on_mcu(files, options.mcu, how, console)
     return INTERRUPTED if interrupted else FINE
 
 

@@ -11,40 +11,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from marotte import ports, wiring
+from marotte import ports
 from marotte.emulated import open_mcu
 from marotte.errors import MarotteError
+from marotte.files import Files, Watch
 from marotte.link import LinkError
 from marotte.ports import SerialCarrier
 from marotte.pulses import PulseSummary, measure
-from marotte.puppet import Puppet
-from marotte.puppet_file import read_puppet
-from marotte.score import Score, read_score
-from marotte.tomlfile import FileMistakes
 from marotte.view import View
-from marotte.wiring import Robot
-
-
-@dataclass(frozen=True)
-class Files:
-    """A puppet, what it plays, and on which robot."""
-
-    puppet: Puppet
-    score: Score
-    robot: Robot | None
-
-
-def load(puppet_path: str, score_path: str, robot_path: str | None) -> Files:
-    """Return what the files hold. Raises FileMistakes, with the mistakes of all of them."""
-    puppet, mistakes = read_puppet(puppet_path)
-    if not puppet.dofs:
-        raise FileMistakes(mistakes)  # nothing that the others could be checked against
-    score, score_mistakes = read_score(score_path, puppet)
-    robot, robot_mistakes = wiring.read_robot(robot_path, puppet) if robot_path else (None, [])
-    mistakes = [*mistakes, *score_mistakes, *robot_mistakes]
-    if mistakes:
-        raise FileMistakes(mistakes)
-    return Files(puppet, score, robot)
 
 
 def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console: Console) -> None:
@@ -77,26 +51,36 @@ def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console:
         print(f"  {key}: {value:,}" if isinstance(value, int) else f"  {key}: {value}")
 
 
-def run_on_port(files: Files, port: str, arm: bool, seconds: Fraction | None, no_view: bool, console: Console) -> bool:
+@dataclass(frozen=True)
+class RunOptions:
+    """How to play live."""
+
+    arm: bool = False
+    seconds: Fraction | None = None
+    no_view: bool = False
+    watch: Watch | None = None
+
+
+def run_on_port(files: Files, port: str, options: RunOptions, console: Console) -> bool:
     """Play live on a port; return whether the user ended it. Raises MarotteError."""
     carrier = SerialCarrier(port)
     try:
-        return _perform(files, carrier, port, arm, seconds, no_view, console)
+        return _perform(files, carrier, port, options, console)
     finally:
         carrier.close()
 
 
-def run_on_mcu(files: Files, mcu: str, arm: bool, seconds: Fraction | None, no_view: bool, console: Console) -> bool:
+def run_on_mcu(files: Files, mcu: str, options: RunOptions, console: Console) -> bool:
     """Play live on an emulated MCU and show the pulses of its pins; return whether the user ended it. Raises MarotteError."""
     from marotte.mcu.serve import serve
 
     with open_mcu(mcu) as virtual, serve(virtual) as live:
         carrier = SerialCarrier(live.url)
         try:
-            interrupted = _perform(files, carrier, f"emulated {mcu} at {live.url}", arm, seconds, no_view, console)
+            interrupted = _perform(files, carrier, f"emulated {mcu} at {live.url}", options, console)
         finally:
             carrier.close()
-        if files.robot and arm:
+        if files.robot and options.arm:
             live.stop()
             _print_pulses(measure(virtual, files.robot), console)
     return interrupted
@@ -126,21 +110,23 @@ def list_ports() -> None:
         print("no serial port found (is the robot plugged in?)")
 
 
-def _perform(
-    files: Files,
-    carrier: SerialCarrier,
-    where: str,
-    arm: bool,
-    seconds: Fraction | None,
-    no_view: bool,
-    console: Console,
-) -> bool:
+def _perform(files: Files, carrier: SerialCarrier, where: str, options: RunOptions, console: Console) -> bool:
     from marotte.run import default_seconds, perform
 
+    arm, seconds = options.arm, options.seconds
     length_s = float(default_seconds(files.score) if seconds is None else seconds)
-    with View(files.puppet, files.robot if arm else None, where, length_s, console, quiet=no_view) as view:
+    with View(files.puppet, files.robot if arm else None, where, length_s, console, quiet=options.no_view) as view:
         try:
-            performance = perform(files.puppet, files.score, carrier, view, robot=files.robot, arm=arm, seconds=seconds)
+            performance = perform(
+                files.puppet,
+                files.score,
+                carrier,
+                view,
+                robot=files.robot,
+                arm=arm,
+                seconds=seconds,
+                watch=options.watch,
+            )
         except LinkError as error:
             raise LinkError(f"{where}: {error}") from error
     status = performance.status

@@ -3,8 +3,8 @@
     part = compile_expression(parse("0.7*rsin(2*t + 0.25) + 0.3*noise1(t/2)"))
     print(part.instructions)
 
-Source: docs/motion.md, functions. A text is parsed with Python's own parser and never evaluated. Numbers are the decimals that the
-text shows, kept exactly until they become words.
+Source: docs/motion.md, functions. A text is parsed with Python's own parser and never evaluated. Numbers are the decimals that
+the text shows, kept exactly until they become words.
 """
 
 from __future__ import annotations

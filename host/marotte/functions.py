@@ -1,8 +1,8 @@
 """The FUNCTION of a mapping: read from its text in the puppet file.
 
 Source: docs/motion.md, functions. A text is a bare name (`"noise2"`), a call of one that stands alone (`"blink(0.93, 1.2)"`), the
-name of a `[function.NAME]`, or an expression (`"const(0.3)"`, `"live(GAZE_YAW)"`, `"0.5*rsin(2*t)"`). An expression becomes what it
-is in effect: `"rsin(t + 1)"` is `rsin`.
+name of a `[function.NAME]`, or an expression (`"const(0.3)"`, `"live(GAZE_YAW)"`, `"0.5*rsin(2*t)"`). An expression becomes what
+it is in effect: `"rsin(t + 1)"` is `rsin`.
 """
 
 from __future__ import annotations

@@ -49,6 +49,12 @@ class LinkRefused(LinkError):
         self.detail = detail
 
 
+def refusal(name: str, status: int, detail: int) -> LinkRefused:
+    """Return the error for a message that the MCU refused."""
+    text = messages.STATUS_TEXT[status] if status < len(messages.STATUS_TEXT) else f"status {status}"
+    return LinkRefused(f"the MCU refused {name!r}: {text} (detail {detail})", status, detail)
+
+
 class Carrier(Protocol):
     """What takes the link's bytes to an MCU and back."""
 
@@ -255,9 +261,7 @@ class Link:
         if status == messages.OK:
             return
         if command.on_refused is None:
-            text = messages.STATUS_TEXT[status] if status < len(messages.STATUS_TEXT) else f"status {status}"
-            refusal = LinkRefused(f"the MCU refused {command.name!r}: {text} (detail {detail})", status, detail)
-            self._refusals.append(refusal)
+            self._refusals.append(refusal(command.name, status, detail))
             return
         command.on_refused(status, detail)
 

@@ -52,22 +52,29 @@ class Prompter:
             if self._waiting_targets + size > self._queue_max:
                 break
             step = self._steps.popleft()
-            self._send(step)
+            self._send(step, step.frame)
             self._waiting.append((step.frame, size))
             self._waiting_targets += size
             sent.append(step)
         return sent
 
-    def _send(self, step: Step) -> None:
+    def exchange(self, state: Step, steps: Sequence[Step]) -> None:
+        """Go on with the steps of another score that are after `state`, which holds as soon as it arrives.
+
+        What has been sent of the old score counts as waiting still, so that there is room whatever has become of it.
+        """
+        self._steps = deque(step for step in steps if step.frame > state.frame)
+        self._send(state, formats.FRAME_NOW)
+
+    def _send(self, step: Step, frame: int) -> None:
         if step.weights:
-            weights = {action: weight_q28(target) for action, target in step.weights.items()}
-            self._session.weight_targets(step.frame, weights)
+            self._session.weight_targets(frame, {index: weight_q28(target) for index, target in step.weights.items()})
         if step.lives:
-            self._session.live_targets(step.frame, {live: weight_q28(target) for live, target in step.lives.items()})
+            self._session.live_targets(frame, {index: weight_q28(target) for index, target in step.lives.items()})
         if step.master_tempo is not None:
-            self._session.tempo(step.frame, formats.MASTER, tempo_q16(step.master_tempo))
+            self._session.tempo(frame, formats.MASTER, tempo_q16(step.master_tempo))
         for action, tempo in step.tempos.items():
-            self._session.tempo(step.frame, action, tempo_q16(tempo))
+            self._session.tempo(frame, action, tempo_q16(tempo))
 
 
 def _targets(step: Step) -> int:

@@ -6,16 +6,19 @@ import contextlib
 import signal
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 from marotte.errors import MarotteError
-from marotte.link import Carrier
+from marotte.files import Files, Watch
+from marotte.link import Carrier, LinkRefused
 from marotte.prompter import Prompter
 from marotte.puppet import Puppet
 from marotte.score import Score
+from marotte.score import state as score_state
 from marotte.session import Session
 from marotte.tables import build_tables, value_of
+from marotte.tomlfile import FileMistakes
 from marotte.view import REFRESH_HZ, Scene, View
 from marotte.wiring import Robot
 from shared import formats
@@ -54,27 +57,28 @@ def perform(
     robot: Robot | None = None,
     arm: bool = False,
     seconds: Fraction | None = None,
+    watch: Watch | None = None,
 ) -> Performance:
     """Upload a puppet, play a score for `seconds` (default: to its end and a little longer), and stop.
 
-    With `arm` the robot's outputs give pulses. Whatever ends the run, Ctrl-C and SIGTERM included, the outputs are killed and the
+    With `arm` the robot's outputs give pulses. With `watch` what changes in the files is played as soon as it is there; mistakes
+    in them are told, and what played plays on. Whatever ends the run, Ctrl-C and SIGTERM included, the outputs are killed and the
     motion is stopped before this returns or raises. Raises MarotteError.
     """
-    length_s = default_seconds(score) if seconds is None else seconds
-    last_frame = round(length_s * puppet.frame_rate_hz) - 1
     session = Session(carrier)
     session.open()
     begin_us = carrier.now_us()
     session.upload(build_tables(puppet, robot))
     view.note(f"{puppet.name} uploaded in {(carrier.now_us() - begin_us) / 1000:.0f} ms, on {view.where}")
-    session.telemetry(formats.TAP_MOTOR, _every(puppet, REFRESH_HZ), _every(puppet, WEIGHTS_HZ))
-    play = _Play(puppet, score, session, view)
+    play = _Play(Files(puppet, score, robot), session, view, arm, seconds)
     performance = Performance()
     with _interruptible(), _safe_end(session, performance):
-        play.begin(arm)
+        play.begin()
         try:
-            while play.scene.frame < last_frame:
+            while not play.is_done:
                 play.go_on()
+                if watch:
+                    play.look(watch)
         except KeyboardInterrupt:
             performance.is_interrupted = True
         performance.frames = play.scene.frame + 1
@@ -82,23 +86,30 @@ def perform(
 
 
 class _Play:
-    """One score under way."""
+    """A performance under way."""
 
-    def __init__(self, puppet: Puppet, score: Score, session: Session, view: View) -> None:
-        self.puppet = puppet
+    def __init__(self, files: Files, session: Session, view: View, arm: bool, seconds: Fraction | None) -> None:
         self.session = session
         self.view = view
         self.scene = Scene()
-        self._dofs = list(puppet.dofs.values())
-        self._actions = list(puppet.actions)
-        self._cues = [(cue.frame(puppet.frame_rate_hz), cue) for cue in sorted(score.cues, key=lambda cue: cue.at_s)]
-        self._prompter = Prompter(session, score.steps(puppet), session.welcome["queue_max"])
+        self._arm = arm
+        self._seconds = seconds
         self._quiet_us = 0
+        self._take(files)
+        self._prompter = Prompter(session, self._steps, session.welcome["queue_max"])
 
-    def begin(self, arm: bool) -> None:
+    @property
+    def is_done(self) -> bool:
+        """Whether its time is over."""
+        length_s = default_seconds(self.files.score) if self._seconds is None else self._seconds
+        return self.scene.frame >= round(length_s * self.files.puppet.frame_rate_hz) - 1
+
+    def begin(self) -> None:
         """Send the first steps and start the motion, so that the cues of frame 0 act in frame 0."""
+        puppet = self.files.puppet
+        self.session.telemetry(formats.TAP_MOTOR, _every(puppet, REFRESH_HZ), _every(puppet, WEIGHTS_HZ))
         self._prompter.reached(-1)
-        if arm:
+        if self._arm:
             self.session.arm()
         self.session.start()
 
@@ -106,18 +117,81 @@ class _Play:
         """Let a moment pass, and show what came of it."""
         self.session.pump(PUMP_US)
         self._quiet_us += PUMP_US
-        while self.session.taps:
-            frame, _, values_q15 = self.session.taps.popleft()
-            pairs = zip(self._dofs, values_q15, strict=True)
-            self.scene.values = {dof.name: value_of(value_q15, dof) for dof, value_q15 in pairs}
-            self.scene.frame = frame
-            self._quiet_us = 0
-        _, weights_q12 = self.session.weights
-        self.scene.weights = {self._actions[index]: weight / WEIGHT_Q12_ONE for index, weight in weights_q12.items()}
+        self._take_telemetry()
         self.scene.is_silent = self._quiet_us > SILENT_S * 1e6
         self._prompter.reached(self.scene.frame)
         self._tell_cues()
         self.view.show(self.scene)
+
+    def look(self, watch: Watch) -> None:
+        """Play on with the files of a watch if they have changed; if they have mistakes, tell them."""
+        try:
+            files = watch.changed(self.session.carrier.now_us())
+            if files:
+                self._exchange(files)
+        except (FileMistakes, LinkRefused) as error:
+            self.view.note(f"{error}\n{self.files.puppet.name} plays on as it was")
+
+    def _exchange(self, files: Files) -> None:
+        """Replace puppet and score. Raises LinkRefused if the MCU does not take them; nothing has changed then."""
+        before = self.files.puppet
+        tables = build_tables(files.puppet, files.robot)
+        begin_us = self.session.carrier.now_us()
+        if files.puppet.frame_rate_hz != before.frame_rate_hz:
+            self.session.upload(tables)
+            self._restart(files)
+            how = f"with a new frame rate: its motion begins anew at {files.puppet.frame_rate_hz} frames a second"
+        else:
+            self.session.exchange(tables, before)
+            took_ms = (self.session.carrier.now_us() - begin_us) / 1000
+            self._go_on_with(files)
+            how = f"in {took_ms:.0f} ms"
+        length_s = float(default_seconds(files.score) if self._seconds is None else self._seconds)
+        self.view.exchange(files.puppet, files.robot if self._arm else None, length_s)
+        self.view.note(f"{files.puppet.name} exchanged {how}")
+
+    def _restart(self, files: Files) -> None:
+        self.scene = Scene()
+        self.session.taps.clear()
+        self._take(files)
+        self._prompter = Prompter(self.session, self._steps, self.session.welcome["queue_max"])
+        self.begin()
+
+    def _go_on_with(self, files: Files) -> None:
+        """Bring what has been exchanged to where the new score stands."""
+        self._take_telemetry()
+        before = self.files.puppet
+        was = score_state(self._steps, before, self.scene.frame)
+        self._take(files)
+        state = score_state(self._steps, files.puppet, self.scene.frame)
+        actions = list(before.actions)
+        untouched = [actions[index] for index in was.tempos if actions[index] in files.puppet.actions]
+        tempos = {files.puppet.action_index(name): files.puppet.actions[name].tempo for name in untouched}
+        self._prompter.exchange(replace(state, tempos={**tempos, **state.tempos}), self._steps)
+
+    def _take(self, files: Files) -> None:
+        """Take what is to be played from now on, from the frame that has been reached."""
+        puppet = files.puppet
+        self.files = files
+        self._dofs = list(puppet.dofs.values())
+        self._actions = list(puppet.actions)
+        self._steps = files.score.steps(puppet)
+        cues = [(cue.frame(puppet.frame_rate_hz), cue) for cue in sorted(files.score.cues, key=lambda cue: cue.at_s)]
+        self._cues = [(frame, cue) for frame, cue in cues if frame > self.scene.frame]
+        self.scene.values = {}
+        self.scene.weights = {}
+        self.session.weights = (-1, {})
+
+    def _take_telemetry(self) -> None:
+        while self.session.taps:
+            self.scene.frame, _, values_q15 = self.session.taps.popleft()
+            self._quiet_us = 0
+            if len(values_q15) == len(self._dofs):  # not those of a puppet before, which come a moment longer
+                pairs = zip(self._dofs, values_q15, strict=True)
+                self.scene.values = {dof.name: value_of(value_q15, dof) for dof, value_q15 in pairs}
+        _, weights_q12 = self.session.weights
+        known = {index: weight for index, weight in weights_q12.items() if index < len(self._actions)}
+        self.scene.weights = {self._actions[index]: weight / WEIGHT_Q12_ONE for index, weight in known.items()}
 
     def _tell_cues(self) -> None:
         while self._cues and self._cues[0][0] <= self.scene.frame:

@@ -12,7 +12,7 @@ order of their times, then of the file; within a cue: behaviour, weights, mood, 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -90,6 +90,28 @@ class Score:
             frames.setdefault(cue.frame(puppet.frame_rate_hz), []).append(cue)
         targets: dict[str, float] = {}
         return [_step(puppet, frame, cues, targets) for frame, cues in frames.items()]
+
+
+def state(steps: Sequence[Step], puppet: Puppet, frame: int) -> Step:
+    """Return all that holds in a frame: what the steps have set until then, and what nobody has set as it is at the beginning.
+
+    The tempos are only those that a cue has set. A gesture is left out, since it ends by itself: whether it is under way, only
+    the MCU knows.
+    """
+    weights = dict.fromkeys(range(len(puppet.actions)), 0.0)
+    lives = {index: live.rest for index, live in enumerate(puppet.lives.values())}
+    tempos: dict[int, float] = {}
+    master_tempo = 1.0
+    for step in steps:
+        if step.frame <= frame:
+            weights.update(step.weights)
+            lives.update(step.lives)
+            tempos.update(step.tempos)
+            master_tempo = step.master_tempo if step.master_tempo is not None else master_tempo
+    for index, action in enumerate(puppet.actions.values()):
+        if action.cycles is not None:
+            del weights[index]
+    return Step(frame, weights, lives, master_tempo, tempos)
 
 
 def load_score(path: str | Path, puppet: Puppet) -> Score:

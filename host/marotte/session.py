@@ -12,9 +12,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 
-from marotte.link import Carrier, Link, LinkError, LinkSilent, Message
-from marotte.tables import Tables, items_per_message
+from marotte.link import Carrier, Link, LinkError, LinkRefused, LinkSilent, Message, refusal
+from marotte.puppet import Puppet
+from marotte.tables import Tables, items_per_message, keeps
 from shared import codec, messages
 
 OPEN_TIMEOUT_S = 1.5
@@ -86,6 +88,22 @@ class Session:
             self._step(end_us, "the puppet's tables were not acknowledged")
             if progress:
                 progress(max(0, len(parts) - self.link.pending), len(parts))
+
+    def exchange(self, tables: Tables, playing: Puppet) -> None:
+        """Replace the tables of a puppet that moves, at the beginning of a frame.
+
+        `playing` is the puppet whose tables the MCU has; actions, DOFs and live channels that keep their names keep weights,
+        phases, poses and values. The frame rate has to be the same. Raises LinkRefused if the MCU refuses a part; the old tables
+        then play on.
+        """
+        *parts, commit = tables.messages()
+        for group in ([*parts, *keeps(playing, tables.puppet)], [commit]):
+            refused: list[LinkRefused] = []
+            for message in group:
+                self._post(*message, on_refused=partial(_note_refusal, refused, message[0]))
+            self.flush(UPLOAD_TIMEOUT_S)
+            if refused:
+                raise refused[0]
 
     def start(self) -> None:
         """Begin the motion: frame 0 is due when the MCU takes this command."""
@@ -190,3 +208,7 @@ class Session:
         if self.link.counters.bytes:
             return LinkForeign("what answers at this port is not Marotte's firmware; flash it, or choose another port")
         return LinkSilent(f"no answer within {timeout_s:g} s: is the firmware running on the MCU?")
+
+
+def _note_refusal(refused: list[LinkRefused], name: str, status: int, detail: int) -> None:
+    refused.append(refusal(name, status, detail))

@@ -70,6 +70,12 @@ class View:
         if self._live:
             self._live.stop()
 
+    def exchange(self, puppet: Puppet, robot: Robot | None, length_s: float) -> None:
+        """Show another puppet from now on."""
+        self.puppet = puppet
+        self.robot = robot
+        self.length_s = length_s
+
     def show(self, scene: Scene) -> None:
         """Show a scene, in place."""
         if self._live:
