@@ -105,6 +105,7 @@ class Link:
         self._dictionary = codec.crc32(messages.canonical_text().encode())
         self._chunk = bytearray(_CHUNK)
         self._single = bytearray(1)
+        self._heap_free = 0
         self._wire = bytearray(codec.WIRE_MAX)
         self._length = 0
         self._out = bytearray(codec.BODY_MAX)
@@ -277,6 +278,7 @@ class Link:
     def _on_start(self, body, length):
         if not self._puppet.tables.ready:
             return messages.STATE
+        self._heap_free = self._board.heap_free()
         self._puppet.start()
         return messages.OK
 
@@ -377,11 +379,13 @@ class Link:
 
     def _status(self):
         puppet = self._puppet
+        if puppet.frame < 0:  # looking through the heap takes 10 ms, and while frames run it does not change
+            self._heap_free = self._board.heap_free()
         # fmt: off
         pack_into(
             _STATUS_FORMAT, self._out, _PAYLOAD, puppet.frame, puppet.motor.armed, self.silent,
-            puppet.clock.late_max_us, puppet.clock.late_frames, puppet.frame_max_us, self.packets, self.damaged, puppet.cues.late[0],
-            self._board.heap_free(),
+            puppet.clock.late_max_us, puppet.clock.late_frames, puppet.frame_max_us, self.packets, self.damaged,
+            puppet.cues.late[0], self._heap_free,
         )
         # fmt: on
         self._send(messages.STATUS, _STATUS_END)
