@@ -256,8 +256,7 @@ class Link:
         for n in range((length - 2) // item):
             bad = staged.mapping(first + n, *unpack_from(_MAPPING_FORMAT, body, _PAYLOAD + 2 + n * item))
             if bad is not None:
-                self._detail = 1 + 5 * n + bad
-                return messages.RANGE
+                return self._judge(1 + 5 * n + bad)
         return messages.OK
 
     def _on_live(self, body, length):
@@ -324,6 +323,7 @@ class Link:
     def _judge(self, bad_field):
         if bad_field is None:
             return messages.OK
+        self._puppet.staged.ready = False  # a set of which a part was refused is never played
         self._detail = bad_field
         return messages.RANGE
 
