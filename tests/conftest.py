@@ -3,6 +3,10 @@
 import os
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("marotte", deadline=None)  # a slow machine is no fault
+settings.load_profile("marotte")
 
 NEEDS_IMAGES = {"rp2040_image_path", "unix32_path"}
 """Fixtures that only the cross compiler and the 32-bit libraries can provide."""
