@@ -107,11 +107,13 @@ def test_repeated_command_is_answered_as_the_first_time_and_not_carried_out_agai
         (seq, messages.OK, 0),
     ]
     session.link._seq = seq + 2
+    for number in range(formats.QUEUE_MAX - 1):
+        session.live_targets(2000, {0: number})
+    session.flush()
     with pytest.raises(LinkRefused) as refusal:
-        for number in range(formats.QUEUE_MAX):
-            session.live_targets(2000, {0: number})
+        session.live_targets(2000, {0: 0})
         session.flush()
-    assert refusal.value.status == messages.FULL, "one place was taken"
+    assert refusal.value.status == messages.FULL, "one place was taken, and only one"
 
 
 def acknowledged(wire):
