@@ -43,8 +43,9 @@ class LinkSilent(LinkError):
 class LinkRefused(LinkError):
     """The MCU refused a command. `status` and `detail` are those of its acknowledgement."""
 
-    def __init__(self, text: str, status: int, detail: int):
-        super().__init__(text)
+    def __init__(self, name: str, status: int, detail: int):
+        text = messages.STATUS_TEXT[status] if status < len(messages.STATUS_TEXT) else f"status {status}"
+        super().__init__(f"the MCU refused {name!r}: {text} (detail {detail})")
         self.status = status
         self.detail = detail
 
@@ -255,9 +256,7 @@ class Link:
         if status == messages.OK:
             return
         if command.on_refused is None:
-            text = messages.STATUS_TEXT[status] if status < len(messages.STATUS_TEXT) else f"status {status}"
-            refusal = LinkRefused(f"the MCU refused {command.name!r}: {text} (detail {detail})", status, detail)
-            self._refusals.append(refusal)
+            self._refusals.append(LinkRefused(command.name, status, detail))
             return
         command.on_refused(status, detail)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from marotte.link import Carrier, Link, LinkError, LinkSilent, Message
+from marotte.link import Carrier, Link, LinkError, LinkRefused, LinkSilent, Message
 from marotte.tables import Tables, items_per_message
 from shared import codec, messages
 
@@ -49,10 +49,11 @@ class Session:
         self._posted_us = carrier.now_us()
 
     def open(self, timeout_s: float = OPEN_TIMEOUT_S) -> None:
-        """Greet the MCU. Raises LinkSilent if nothing answers in time, LinkForeign if something else does."""
+        """Greet the MCU, at first or again. Raises LinkSilent if nothing answers in time, LinkForeign if something else does."""
         carrier = self.carrier
         end_us = carrier.now_us() + round(timeout_s * 1e6)
         refused: list[int] = []
+        self.welcome = {}
         while not self.welcome:
             if carrier.now_us() >= end_us:
                 raise self._no_welcome(timeout_s)
@@ -79,13 +80,20 @@ class Session:
         """
         self.stop()
         parts = list(tables.messages())
+        refusals: list[LinkRefused] = []
         for name, fields, items in parts:
-            self._post(name, fields, items)
+
+            def refused(status: int, detail: int, name: str = name) -> None:
+                refusals.append(LinkRefused(name, status, detail))
+
+            self._post(name, fields, items, refused)
         end_us = self.carrier.now_us() + round(UPLOAD_TIMEOUT_S * 1e6)
         while self.link.pending:
             self._step(end_us, "the puppet's tables were not acknowledged")
             if progress:
                 progress(max(0, len(parts) - self.link.pending), len(parts))
+        if refusals:
+            raise refusals[0]
 
     def start(self) -> None:
         """Begin the motion: frame 0 is due when the MCU takes this command."""
