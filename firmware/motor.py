@@ -68,6 +68,10 @@ class Motor:
         self._ease_q15 = VALUE_ONE
         self._write(tables.rest_q15)
 
+    def begin(self):
+        """Let relative DOFs have their full speed from the first frame on, however the motion ended before."""
+        self._ease_q15 = VALUE_ONE
+
     def move(self, signal_q15, silent):
         """Bring one frame's values to the outputs; `silent` tells that the link has been quiet too long."""
         tables = self._tables
