@@ -1,9 +1,9 @@
 """The REPL that a Pico has and MicroPython's unix port lacks: raw mode for programs, and a plain friendly one.
 
 Input comes over the board's link; output is what is printed, which the host sends on. Ctrl-A enters raw mode, Ctrl-B
-leaves it (on an empty line), Ctrl-C drops the line, Ctrl-D carries out what was sent in raw mode, and begins the firmware anew in friendly
-mode or where raw mode has nothing to carry out before Ctrl-B. Raw paste mode is refused, as programs that know it
-expect of those that do not.
+leaves it (on an empty line), Ctrl-C drops the line, Ctrl-D carries out what was sent in raw mode, and begins the
+firmware anew in friendly mode or where raw mode has nothing to carry out before Ctrl-B. Raw paste mode is refused, as
+programs that know it expect of those that do not.
 """
 
 import sys
