@@ -186,6 +186,8 @@ class Cues:
 
     def apply(self, frame, weight_target_q28, live_target_q28, tempo_q16, action_tempo_q16):
         """Let the targets due in `frame` act on the arrays; `tempo_q16[0]` is the master tempo."""
+        if self.count == 0:
+            return
         # fmt: off
         self.count = _apply(
             frame, self.count, self._frame, self._kind, self._index, self._value,

@@ -82,6 +82,7 @@ class Puppet:
         self.frame = 0
         self.frame_max_us = 0
         self.cues.counts[0] = 0
+        self.motor.begin()
         self.clock.start(self._board.ticks_us(), self.tables.frame_rate_hz)
 
     def stop(self):

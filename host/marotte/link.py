@@ -166,6 +166,11 @@ class Link:
         """How many commands are not acknowledged yet."""
         return len(self._backlog) + len(self._under_way)
 
+    @property
+    def tail(self) -> bytes:
+        """The last bytes that have come and are no packet yet, at most 1 KB of them."""
+        return self._partial
+
     def post(
         self,
         name: str,

@@ -195,6 +195,11 @@ class Session:
             self._status = message.fields
 
     def _no_welcome(self, timeout_s: float) -> LinkError:
+        if b">>>" in self.link.tail or b"raw REPL" in self.link.tail:
+            return LinkForeign(
+                "MicroPython's REPL answers at this port, not Marotte's firmware: reset the MCU, "
+                "for example with `mpremote reset`; if that does not help, flash the firmware"
+            )
         if self.link.counters.bytes:
             return LinkForeign("what answers at this port is not Marotte's firmware; flash it, or choose another port")
         return LinkSilent(f"no answer within {timeout_s:g} s: is the firmware running on the MCU?")

@@ -16,7 +16,7 @@ from tests.kernels.values import halves, integers, values_q15
 
 ONE = formats.VALUE_ONE
 STILL = ONE // 2
-MOTOR = load_checked("firmware/motor.py", bytecode=("Motor.move", "Motor.stand", "Motor._write"))
+MOTOR = load_checked("firmware/motor.py", bytecode=("Motor.move", "Motor._ease", "Motor.stand", "Motor._write"))
 BOARD = load_checked("firmware/board_rp2040.py", overrides={"machine": types.SimpleNamespace()})
 
 PWM_ADDRESS = 0x40050000

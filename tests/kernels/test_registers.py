@@ -46,6 +46,6 @@ def shifted_indices(function):
     }
 
 
-@pytest.mark.parametrize("function", kernels())
+@pytest.mark.parametrize("function", list(kernels()))
 def test_kernel_indexes_with_no_variable_that_lives_in_a_register(function):
     assert not shifted_indices(function).intersection(first_locals(function))

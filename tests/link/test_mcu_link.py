@@ -180,8 +180,15 @@ def test_targets_that_do_not_fit_are_refused_whole(mcu):
 # Messages that the firmware has to refuse: name, fields that differ from a good message, status, detail.
 GOOD = {
     "begin": {
-        "frame_rate_hz": 30, "dofs": 2, "actions": 1, "mappings": 1, "lives": 1,
-        "seed": 0, "noise_spread_q15": 0, "hold_q26": 1 << 20, "link_timeout_ms": 500,
+        "frame_rate_hz": 30,
+        "dofs": 2,
+        "actions": 1,
+        "mappings": 1,
+        "lives": 1,
+        "seed": 0,
+        "noise_spread_q15": 0,
+        "hold_q26": 1 << 20,
+        "link_timeout_ms": 500,
     },
     "dof": {"dof": 0, "kind": 0, "rest_q15": 0, "low_q15": 0, "high_q15": 32768},
     "output": {"dof": 0, "pin": 2, "pulse0_q4us": 16000, "pulse1_q4us": 32000},

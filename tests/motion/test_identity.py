@@ -27,7 +27,7 @@ SECONDS = 5
 WORKERS = 2
 
 TIMER_COUNT_US = 0.32
-FRAME_LONGEST_US = 8_000
+FRAME_LONGEST_US = 4_000
 """From the instant of a frame to the last byte of its telemetry, at most."""
 
 OUTPUT_PINS = (*range(2, 23), *range(26, 29))
