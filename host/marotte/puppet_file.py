@@ -297,6 +297,7 @@ class _Reader:
         for action in actions.values():
             for entry in action.mappings:
                 pools.code(entry.function)
+        samples = sum(map(len, pools.curves))
         words = sum(map(len, pools.programs))
         for key, what, count, most in (
             ("dof", "DOFs", len(dofs), formats.DOFS_MAX),
@@ -304,6 +305,7 @@ class _Reader:
             ("action", "mappings", self.mapping_count, formats.MAPPINGS_MAX),
             ("live", "live channels", len(self.lives), formats.LIVES_MAX),
             ("function", "different tables in use", len(pools.curves), formats.CURVES_MAX),
+            ("function", "samples of different tables in use", samples, formats.SAMPLES_POOL),
             ("action", "different expressions", len(pools.programs), program.PROGRAMS_MAX),
             ("action", "words of compiled expressions", words, program.POOL_WORDS),
             ("action", "different pairs of threshold and least gap of blinks", len(pools.blinks), formats.BLINKS_MAX),

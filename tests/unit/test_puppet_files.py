@@ -12,6 +12,7 @@ from marotte.positions import line_numbers
 from marotte.puppet_file import load_puppet, read_puppet
 from marotte.supported import NOT_YET
 from marotte.tomlfile import FileMistakes, key_text
+from shared import formats, program
 
 PET = Path(__file__).parents[2] / "puppets" / "pet.toml"
 
@@ -330,34 +331,72 @@ def test_puppet_reports_all_mistakes_in_order_of_lines(tmp_path):
             ),
             "has 528 mappings, expected at most 512",
         ),
-        (
-            "[dof.A]\n"
-            + "".join(f'[action.A{i}]\nmap=[["A",0,1,"C{i}"]]\n' for i in range(17))
-            + "".join(f"[function.C{i}]\ntable=[0, {i / 17}]\n" for i in range(17)),
-            "function: has 17 different tables in use, expected at most 16",
-        ),
-        (
-            "[dof.A]\n[dof.B]\n"
-            + "".join(
-                f'[action.A{i}]\nmap=[["A",0,1,"rsin(t+0.{i:02})/2"], ["B",0,1,"rcos(t+0.{i:02})/2"]]\n'
-                for i in range(34)
-            ),
-            "action: has 68 different expressions, expected at most 64",
-        ),
-        (
-            "[dof.A]\n"
-            + "".join(f'[action.A{i}]\nmap=[["A",0,1,"{"+".join(["noise1(t)"] * 7)}+0.{i:02}"]]\n' for i in range(24)),
-            "action: has 1056 words of compiled expressions, expected at most 1024",
-        ),
-        (
-            "[dof.A]\n" + "".join(f'[action.A{i}]\nmap=[["A",0,1,"blink(0.9, {i})"]]\n' for i in range(33)),
-            "action: has 33 different pairs of threshold and least gap of blinks, expected at most 32",
-        ),
         ("", "has no DOF, expected at least one"),
     ],
 )
 def test_puppet_counts_are_held_to_the_capacity(tmp_path, text, expected):
     assert any(expected in line for line in mistakes_of(tmp_path, text))
+
+
+def mapped(texts, functions=""):
+    """Return a puppet whose mappings have these functions, spread over 16 DOFs."""
+    text = "".join(f"[dof.D{j}]\n" for j in range(16)) + functions
+    for i in range(0, len(texts), 16):
+        rows = ",".join(f'["D{j}", 0, 1, "{function}"]' for j, function in enumerate(texts[i : i + 16]))
+        text += f"[action.A{i}]\nmap = [{rows}]\n"
+    return text
+
+
+def tables(count, samples):
+    """Return the text of so many different table functions."""
+    return "".join(f"[function.C{i}]\ntable = [{i / count}{', 0.5' * (samples - 1)}]\n" for i in range(count))
+
+
+LONG = "+".join(["noise1(t)"] * 7)
+LONG_WORDS = 7 * 5 + 6 + 3  # a noise and an ADD each, CONST and ADD of the number behind
+CURVES, SAMPLES, PROGRAMS, WORDS, BLINKS = (
+    formats.CURVES_MAX,
+    formats.SAMPLES_POOL,
+    program.PROGRAMS_MAX,
+    program.POOL_WORDS // LONG_WORDS,
+    formats.BLINKS_MAX,
+)
+
+
+@pytest.mark.parametrize(
+    ("puppet", "count", "most", "what"),
+    [
+        (lambda n: mapped([f"C{i}" for i in range(n)], tables(n, 2)), CURVES, CURVES, "different tables in use"),
+        (
+            lambda n: mapped([f"C{i}" for i in range(n)], tables(n, 256)),
+            SAMPLES // 256,
+            SAMPLES,
+            "samples of different tables in use",
+        ),
+        (
+            lambda n: mapped([f"rsin(t + {i}/512)" for i in range(1, n + 1)]),
+            PROGRAMS,
+            PROGRAMS,
+            "different expressions",
+        ),
+        (
+            lambda n: mapped([f"{LONG} + {i / 1000}" for i in range(1, n + 1)]),
+            WORDS,
+            program.POOL_WORDS,
+            "words of compiled expressions",
+        ),
+        (lambda n: mapped([f"blink(0.9, {i})" for i in range(n)]), BLINKS, BLINKS, "different pairs of threshold"),
+    ],
+)
+def test_puppet_functions_are_held_to_the_capacity(tmp_path, puppet, count, most, what):
+    assert mistakes_of(tmp_path, puppet(count)) == []
+    (found,) = mistakes_of(tmp_path, puppet(count + 1))
+    assert re.search(rf"(action|function): has \d+ {what}.*, expected at most {most}$", found)
+
+
+def test_puppet_equal_functions_count_once(tmp_path):
+    text = mapped(["rsin(t + 0.5)", "C0", "blink(0.9, 1)"] * 100, tables(1, 256))
+    assert mistakes_of(tmp_path, text) == []
 
 
 def test_puppet_of_full_capacity_is_fine(tmp_path):
