@@ -20,6 +20,7 @@ from micropython import const
 
 from firmware import cues
 from firmware.clock import ticks_diff
+from firmware.exchange import check_kept
 from shared import codec, messages
 from shared.formats import (
     ACTIONS_MAX,
@@ -234,6 +235,8 @@ class Link:
         return messages.OK
 
     def _on_begin(self, body, length):
+        if self._puppet.exchange.step >= 0:
+            return messages.STATE
         return self._judge(self._puppet.staged.begin(*self._fields(messages.BEGIN, body)))
 
     def _on_dof(self, body, length):
@@ -274,7 +277,15 @@ class Link:
         return self._staged() or self._judge(self._puppet.staged.blink(*self._fields(messages.BLINK, body)))
 
     def _on_keep(self, body, length):
-        return messages.STATE
+        status = self._staged()
+        if status:
+            return status
+        kind, first = self._fields(messages.KEEP, body)
+        for place in range(length - 2):
+            bad = self._puppet.staged.keep(kind, first, place, body[_PAYLOAD + 2 + place])
+            if bad is not None:
+                return self._judge(bad)
+        return messages.OK
 
     def _stream(self, message_id, body, length, begin, store):
         """Store what comes in several packets: the fields to `begin`, then each item to `store`."""
@@ -290,7 +301,8 @@ class Link:
 
     def _on_commit(self, body, length):
         puppet = self._puppet
-        if puppet.frame >= 0:
+        playing = puppet.frame >= 0
+        if playing and puppet.staged.frame_rate_hz != puppet.tables.frame_rate_hz:
             return messages.STATE
         status = self._staged()
         if status:
@@ -299,6 +311,8 @@ class Link:
         if self._detail:
             return messages.INCOMPLETE
         bad = self._judge(puppet.staged.doubled())
+        if bad == messages.OK and playing and not check_kept(puppet.staged, puppet.tables):
+            bad = self._judge(0)
         if bad == messages.OK:
             puppet.commit()
         return bad
@@ -344,7 +358,9 @@ class Link:
         return messages.OK
 
     def _staged(self):
-        return messages.OK if self._puppet.staged.ready else messages.STATE
+        """Return whether tables may come: after `begin`, and not while others wait to be put into force."""
+        puppet = self._puppet
+        return messages.OK if puppet.staged.ready and puppet.exchange.step < 0 else messages.STATE
 
     def _judge(self, bad_field):
         if bad_field is None:

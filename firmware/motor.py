@@ -68,6 +68,21 @@ class Motor:
         self._ease_q15 = VALUE_ONE
         self._write(tables.rest_q15)
 
+    def exchange(self, tables):
+        """Take over other tables while the motion goes on. Pins that are no longer used fall silent; new ones wait for `arm`."""
+        before = self._tables
+        for d in range(before.dofs):
+            pin = before.pin[d]
+            if pin != NO_PIN and not self._drives(tables, pin):
+                self._board.release(pin)
+        self._tables = tables
+
+    def _drives(self, tables, pin):
+        for d in range(tables.dofs):
+            if tables.pin[d] == pin:
+                return True
+        return False
+
     def begin(self):
         """Let relative DOFs have their full speed from the first frame on, however the motion ended before."""
         self._ease_q15 = VALUE_ONE
