@@ -71,7 +71,7 @@ def _phases(
 
 @micropython.viper
 def _rebase(
-    i: int, p_cycle: int, p_q24: int, cycle: ptr16, fraction_q24: ptr32, kept_cycle: ptr16, offset_q28: ptr32
+    cycle: ptr16, fraction_q24: ptr32, kept_cycle: ptr16, offset_q28: ptr32, i: int, p_cycle: int, p_q24: int
 ):
     """Choose `c` and `o` of action `i` so that its phase is `p`; `cycle[i]`, `fraction_q24[i]` hold its nominal phase.
 
@@ -264,4 +264,4 @@ class Actions:
     def _place(self, i, cycle, fraction_q24, master, rate_hz):
         """Let action `i` have a phase."""
         self._nominal(i, master, rate_hz)
-        _rebase(i, cycle, fraction_q24, self.cycle, self.fraction_q24, self.kept_cycle, self.offset_q28)
+        _rebase(self.cycle, self.fraction_q24, self.kept_cycle, self.offset_q28, i, cycle, fraction_q24)

@@ -91,23 +91,72 @@ def _evaluate(
         n += 1
 
 
+@micropython.viper
+def _carry(count: int, old_mapping: ptr16, values: ptr16, fresh: ptr16, scratch: ptr32):
+    """Let `values[m]` be what `values[old_mapping[m]]` was, or `fresh[m]` where that is 0xFFFF."""
+    m = 0
+    while m < count:
+        k = int(old_mapping[m])
+        scratch[m] = int(fresh[m]) if k == 0xFFFF else int(values[k])
+        m += 1
+    m = 0
+    while m < count:
+        values[m] = scratch[m]
+        m += 1
+
+
+@micropython.viper
+def _carry_states(count: int, old_mapping: ptr16, start_q18: ptr32, flags: ptr8, scratch: ptr32):
+    """Do the same with starts and flags; what is new is idle, its last blink long ago."""
+    m = 0
+    while m < count:
+        k = int(old_mapping[m])
+        scratch[m] = 0 if k == 0xFFFF else start_q18[k]
+        m += 1
+    m = 0
+    while m < count:
+        start_q18[m] = scratch[m]
+        k = int(old_mapping[m])
+        scratch[m] = 2 if k == 0xFFFF else int(flags[k])
+        m += 1
+    m = 0
+    while m < count:
+        flags[m] = scratch[m]
+        m += 1
+
+
 class Blinks:
     """The streams and states of all mappings that blink, by index of the mapping."""
 
     def __init__(self):
+        self._next_low = halves(MAPPINGS_MAX)
+        self._next_high = halves(MAPPINGS_MAX)
         self._stream_low = halves(MAPPINGS_MAX)
         self._stream_high = halves(MAPPINGS_MAX)
         self._start_q18 = words(MAPPINGS_MAX)
         self._flags = bytearray(MAPPINGS_MAX)
 
-    def seed(self, tables):
-        """Begin all streams anew. Allocates large integers: not for the performance."""
+    def seed_next(self, seed, mapping):
+        """Prepare the stream of a mapping of the next tables. Allocates large integers."""
+        state = (seed * 0x9E3779B1 + (256 + mapping) * 0x85EBCA77) & 0xFFFFFFFF or 1
+        self._next_low[mapping] = state & 0xFFFF
+        self._next_high[mapping] = state >> 16
+
+    def exchange(self, tables, old_mapping, scratch):
+        """Take over the prepared streams, but go on with the state of `old_mapping[m]` where that is not 0xFFFF."""
+        count = tables.mappings
+        _carry(count, old_mapping, self._stream_low, self._next_low, scratch)
+        _carry(count, old_mapping, self._stream_high, self._next_high, scratch)
+        _carry_states(count, old_mapping, self._start_q18, self._flags, scratch)
+
+    def rest(self, tables):
+        """Begin all streams anew, all idle. Allocates large integers: not for the performance."""
         for mapping in range(tables.mappings):
+            self._flags[mapping] = _LONG_AGO
             if tables.function[mapping] >= FUNCTION_BLINK:
-                state = (tables.seed * 0x9E3779B1 + (256 + mapping) * 0x85EBCA77) & 0xFFFFFFFF or 1
-                self._stream_low[mapping] = state & 0xFFFF
-                self._stream_high[mapping] = state >> 16
-                self._flags[mapping] = _LONG_AGO
+                self.seed_next(tables.seed, mapping)
+                self._stream_low[mapping] = self._next_low[mapping]
+                self._stream_high[mapping] = self._next_high[mapping]
 
     def enter(self, tables, action):
         """Let an action's blinks be idle, their last one long ago; their streams go on."""

@@ -149,14 +149,17 @@ class Board:
         """Set the pulse widths from the next period on: `pulse_q4us[d]` on `pin[d]` where that is attached."""
         _pulses(count, pin, self._attached, pulse_q4us)
 
+    def release(self, pin):
+        """Drive one pin low and take it from its PWM channel."""
+        if self._attached[pin]:
+            machine.Pin(pin, machine.Pin.OUT, value=0)
+            _compare(_PWM_WORD + ((pin >> 1) & 7) * _SLICE_WORDS, pin & 1, 0)
+            self._attached[pin] = 0
+
     def quiet(self):
         """Drive all attached pins low at once, whatever the PWM counters stand at."""
-        attached = self._attached
         for pin in range(_LAST_PIN + 1):
-            if attached[pin]:
-                machine.Pin(pin, machine.Pin.OUT, value=0)
-                _compare(_PWM_WORD + ((pin >> 1) & 7) * _SLICE_WORDS, pin & 1, 0)
-                attached[pin] = 0
+            self.release(pin)
 
     def heap_free(self):
         """Return the free bytes of the heap."""

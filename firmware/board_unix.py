@@ -107,6 +107,11 @@ class Board:
                 self._out[at + 2] = pulse_q4us[d] >> 8
                 at += 3
 
+    def release(self, pin):
+        """Take the pulses of one pin away."""
+        self._attached[pin] = 0
+        self._out[self._record(b"R", 1)] = pin
+
     def quiet(self):
         """Take all pulses away."""
         for pin in range(29):

@@ -134,6 +134,49 @@ def _apply(
     return kept
 
 
+@micropython.viper
+def _renumber(
+    count: int,
+    queue_frame: ptr32,
+    queue_kind: ptr8,
+    queue_index: ptr8,
+    queue_value: ptr32,
+    keep_action: ptr8,
+    actions: int,
+    keep_live: ptr8,
+    lives: int,
+) -> int:
+    """Let targets that wait mean the new places of what they meant; return how many are left."""
+    kept = 0
+    n = 0
+    while n < count:
+        index = int(queue_index[n])
+        kind = int(queue_kind[n]) & 127
+        place = -1
+        if kind == TEMPO and index == MASTER_INDEX:
+            place = index
+        elif kind == LIVE:
+            i = 0
+            while i < lives:
+                if keep_live[i] == index:
+                    place = i
+                i += 1
+        else:
+            i = 0
+            while i < actions:
+                if keep_action[i] == index:
+                    place = i
+                i += 1
+        if place >= 0:
+            queue_frame[kept] = queue_frame[n]
+            queue_kind[kept] = queue_kind[n]
+            queue_value[kept] = queue_value[n]
+            queue_index[kept] = place
+            kept += 1
+        n += 1
+    return kept
+
+
 class Cues:
     """The queue of stamped targets.
 
@@ -153,6 +196,14 @@ class Cues:
     def clear(self):
         """Forget all that wait."""
         self.count = 0
+
+    def renumber(self, keep_action, actions, keep_live, lives):
+        """Follow an exchange of tables: the lists say what each new action and live channel was. What is gone is dropped."""
+        # fmt: off
+        self.count = _renumber(
+            self.count, self._frame, self._kind, self._index, self._value, keep_action, actions, keep_live, lives
+        )
+        # fmt: on
 
     def put(self, kind, body, start, length, indices):
         """Queue the targets of a payload, or none of them; return a status.
@@ -186,6 +237,8 @@ class Cues:
 
     def apply(self, frame, weight_target_q28, live_target_q28, tempo_q16, action_tempo_q16):
         """Let the targets due in `frame` act on the arrays; `tempo_q16[0]` is the master tempo."""
+        if self.count == 0:
+            return
         # fmt: off
         self.count = _apply(
             frame, self.count, self._frame, self._kind, self._index, self._value,

@@ -9,7 +9,7 @@ from array import array
 import micropython
 from micropython import const
 
-from shared.formats import GRADIENTS, NOISE_TABLES
+from shared.formats import GRADIENTS
 
 # One step of the sine table, 2 pi / 512, as a rotation in Q40.
 _STEP_COS_Q40 = 1099428836573
@@ -61,16 +61,15 @@ def _draw(gradients: ptr16, first: int, count: int, low: int, high: int, spread_
         n += 1
 
 
-def fill_gradients(gradients, seed, spread_q15):
-    """Draw the gradients of all 16 noise tables of a puppet seed into an array of 16 * 256 unsigned 16-bit words.
+def fill_gradients(gradients, k, seed, spread_q15):
+    """Draw the gradients of noise table `k` (1..16) of a puppet seed into its 256 of 16 * 256 unsigned 16-bit words.
 
-    A gradient -1 <= g < 1 is stored as `32768 * g + 32768`. Table `k` (1..16) starts from `(seed * 0x9E3779B1 + k *
-    0x85EBCA77) mod 2^32`, or 1 if that is 0. `spread_q15` (0..32768) raises small magnitudes: `|g|` becomes `spread +
-    (1 - spread) * |g|`, 0 counting as positive. Allocates large integers: not for the performance.
+    A gradient -1 <= g < 1 is stored as `32768 * g + 32768`. The table starts from `(seed * 0x9E3779B1 + k * 0x85EBCA77)
+    mod 2^32`, or 1 if that is 0. `spread_q15` (0..32768) raises small magnitudes: `|g|` becomes `spread + (1 - spread)
+    * |g|`, 0 counting as positive. Allocates large integers.
     """
-    for k in range(1, NOISE_TABLES + 1):
-        state = (seed * 0x9E3779B1 + k * 0x85EBCA77) & 0xFFFFFFFF or 1
-        _draw(gradients, (k - 1) * GRADIENTS, GRADIENTS, state & 0xFFFF, state >> 16, spread_q15)
+    state = (seed * 0x9E3779B1 + k * 0x85EBCA77) & 0xFFFFFFFF or 1
+    _draw(gradients, (k - 1) * GRADIENTS, GRADIENTS, state & 0xFFFF, state >> 16, spread_q15)
 
 
 # As in shared.formats; viper inlines constants of its own file only.

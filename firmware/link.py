@@ -5,20 +5,22 @@ good as lost; one that comes after a gap is answered with the number that is exp
 answer. `hello` begins a session with whatever number it has. Nothing here allocates while a puppet plays: tables are
 what `begin` .. `commit` bring, and those come first.
 
-The REPL is called for by `0D 03` where a packet would begin and then a pause, another `0D`, or another `03`, as mpremote and others
-do it. `0D 03` alone would not do: a single flipped bit can make a packet begin with it, and would end the performance.
+The REPL is called for by `0D 03` where a packet would begin and then a pause, another `0D`, or another `03`, as
+mpremote and others do it. `0D 03` alone would not do: a single flipped bit can make a packet begin with it, and would
+end the performance.
 
 A reader of the wire must not trust it: kernels get only indices and lengths that were checked here, in `tables` or in
 `cues`.
 """
 
-from struct import pack_into, unpack_from
+from struct import pack, pack_into, unpack_from
 
 import micropython
 from micropython import const
 
 from firmware import cues
 from firmware.clock import ticks_diff
+from firmware.exchange import check_kept
 from shared import codec, messages
 from shared.formats import (
     ACTIONS_MAX,
@@ -36,6 +38,7 @@ _STALE_US = const(20000)  # a partial packet older than this is dropped
 _HISTORY = const(16)  # answers kept for repeated commands; the host has fewer under way
 _PAYLOAD = const(2)  # place of the payload in a body
 
+_HELLO_FORMAT = messages.struct_format(messages.find(messages.HELLO)[2])
 _WELCOME_FIELDS = messages.find(messages.WELCOME)[2]
 _WELCOME_FORMAT = messages.struct_format(_WELCOME_FIELDS)
 _WELCOME_END = _PAYLOAD + messages.size(_WELCOME_FIELDS)
@@ -103,8 +106,10 @@ class Link:
         self._board = board
         self._puppet = puppet
         self._dictionary = codec.crc32(messages.canonical_text().encode())
+        self._hello = pack(_HELLO_FORMAT, messages.PROTOCOL, self._dictionary)
         self._chunk = bytearray(_CHUNK)
         self._single = bytearray(1)
+        self._heap_free = 0
         self._wire = bytearray(codec.WIRE_MAX)
         self._length = 0
         self._out = bytearray(codec.BODY_MAX)
@@ -221,15 +226,17 @@ class Link:
     def _on_hello(self, body, length):
         self._puppet.cues.clear()
         self._taps = self._taps_every = self._weights_every = 0
-        protocol, dictionary = self._fields(messages.HELLO, body)
-        if protocol != messages.PROTOCOL or dictionary != self._dictionary:
-            return messages.MISMATCH
+        for place in range(length):  # byte by byte, because a host may come back during a performance
+            if body[_PAYLOAD + place] != self._hello[place]:
+                return messages.MISMATCH
         return messages.OK
 
     def _on_ping(self, body, length):
         return messages.OK
 
     def _on_begin(self, body, length):
+        if self._puppet.exchange.step >= 0:
+            return messages.STATE
         return self._judge(self._puppet.staged.begin(*self._fields(messages.BEGIN, body)))
 
     def _on_dof(self, body, length):
@@ -252,8 +259,7 @@ class Link:
         for n in range((length - 2) // item):
             bad = staged.mapping(first + n, *unpack_from(_MAPPING_FORMAT, body, _PAYLOAD + 2 + n * item))
             if bad is not None:
-                self._detail = 1 + 5 * n + bad
-                return messages.RANGE
+                return self._judge(1 + 5 * n + bad)
         return messages.OK
 
     def _on_live(self, body, length):
@@ -271,7 +277,15 @@ class Link:
         return self._staged() or self._judge(self._puppet.staged.blink(*self._fields(messages.BLINK, body)))
 
     def _on_keep(self, body, length):
-        return messages.STATE
+        status = self._staged()
+        if status:
+            return status
+        kind, first = self._fields(messages.KEEP, body)
+        for place in range(length - 2):
+            bad = self._puppet.staged.keep(kind, first, place, body[_PAYLOAD + 2 + place])
+            if bad is not None:
+                return self._judge(bad)
+        return messages.OK
 
     def _stream(self, message_id, body, length, begin, store):
         """Store what comes in several packets: the fields to `begin`, then each item to `store`."""
@@ -287,7 +301,8 @@ class Link:
 
     def _on_commit(self, body, length):
         puppet = self._puppet
-        if puppet.frame >= 0:
+        playing = puppet.frame >= 0
+        if playing and puppet.staged.frame_rate_hz != puppet.tables.frame_rate_hz:
             return messages.STATE
         status = self._staged()
         if status:
@@ -296,6 +311,8 @@ class Link:
         if self._detail:
             return messages.INCOMPLETE
         bad = self._judge(puppet.staged.doubled())
+        if bad == messages.OK and playing and not check_kept(puppet.staged, puppet.tables):
+            bad = self._judge(0)
         if bad == messages.OK:
             puppet.commit()
         return bad
@@ -303,6 +320,7 @@ class Link:
     def _on_start(self, body, length):
         if not self._puppet.tables.ready:
             return messages.STATE
+        self._heap_free = self._board.heap_free()
         self._puppet.start()
         return messages.OK
 
@@ -340,11 +358,14 @@ class Link:
         return messages.OK
 
     def _staged(self):
-        return messages.OK if self._puppet.staged.ready else messages.STATE
+        """Return whether tables may come: after `begin`, and not while others wait to be put into force."""
+        puppet = self._puppet
+        return messages.OK if puppet.staged.ready and puppet.exchange.step < 0 else messages.STATE
 
     def _judge(self, bad_field):
         if bad_field is None:
             return messages.OK
+        self._puppet.staged.ready = False  # a set of which a part was refused is never played
         self._detail = bad_field
         return messages.RANGE
 
@@ -403,11 +424,13 @@ class Link:
 
     def _status(self):
         puppet = self._puppet
+        if puppet.frame < 0:  # looking through the heap takes 10 ms, and while frames run it does not change
+            self._heap_free = self._board.heap_free()
         # fmt: off
         pack_into(
             _STATUS_FORMAT, self._out, _PAYLOAD, puppet.frame, puppet.motor.armed, self.silent,
-            puppet.clock.late_max_us, puppet.clock.late_frames, puppet.frame_max_us, self.packets, self.damaged, puppet.cues.counts[0],
-            self._board.heap_free(),
+            puppet.clock.late_max_us, puppet.clock.late_frames, puppet.frame_max_us, self.packets, self.damaged,
+            puppet.cues.counts[0], self._heap_free,
         )
         # fmt: on
         self._send(messages.STATUS, _STATUS_END)

@@ -26,6 +26,8 @@ def perform(board):
                     puppet.step(link.silent)
                     link.report()
                     continue
+                if puppet.prepare():
+                    continue
             board.wait(longest_us)
     finally:
         puppet.motor.kill()

@@ -68,14 +68,29 @@ class Motor:
         self._ease_q15 = VALUE_ONE
         self._write(tables.rest_q15)
 
+    def exchange(self, tables):
+        """Take over other tables while the motion goes on. Pins that are no longer used fall silent; new ones wait for `arm`."""
+        before = self._tables
+        for d in range(before.dofs):
+            pin = before.pin[d]
+            if pin != NO_PIN and not self._drives(tables, pin):
+                self._board.release(pin)
+        self._tables = tables
+
+    def _drives(self, tables, pin):
+        for d in range(tables.dofs):
+            if tables.pin[d] == pin:
+                return True
+        return False
+
+    def begin(self):
+        """Let relative DOFs have their full speed from the first frame on, however the motion ended before."""
+        self._ease_q15 = VALUE_ONE
+
     def move(self, signal_q15, silent):
         """Bring one frame's values to the outputs; `silent` tells that the link has been quiet too long."""
-        tables = self._tables
-        step_q15 = 1 + _ONE_Q15 * 1000 // (_STOP_MS * tables.frame_rate_hz)
-        if silent:
-            self._ease_q15 = max(0, self._ease_q15 - step_q15)
-        else:
-            self._ease_q15 = min(VALUE_ONE, self._ease_q15 + step_q15)
+        if silent or self._ease_q15 != _ONE_Q15:
+            self._ease(silent)
         self._write(signal_q15)
 
     def stand(self):
@@ -98,6 +113,13 @@ class Motor:
         """Take away all pulses, now."""
         self.armed = False
         self._board.quiet()
+
+    def _ease(self, silent):
+        step_q15 = 1 + _ONE_Q15 * 1000 // (_STOP_MS * self._tables.frame_rate_hz)
+        if silent:
+            self._ease_q15 = max(0, self._ease_q15 - step_q15)
+        else:
+            self._ease_q15 = min(_ONE_Q15, self._ease_q15 + step_q15)
 
     def _write(self, signal_q15):
         tables = self._tables

@@ -8,6 +8,7 @@ from firmware import clock, compositor, functions, weights
 from firmware.actions import Actions
 from firmware.blinks import Blinks
 from firmware.cues import Cues
+from firmware.exchange import Exchange
 from firmware.motor import Motor
 from firmware.programs import Programs
 from firmware.tables import Tables, halves, words
@@ -45,36 +46,36 @@ class Puppet:
         self.signal_q15 = self.base_q15  # until a signal processing layer stands between them
         self._board = board
         self._sine = functions.sine_table()
-        self._gradients = halves(NOISE_TABLES * GRADIENTS)
-        self._drawn = None
+        self.gradients = halves(NOISE_TABLES * GRADIENTS)
         self._master = words(clock.PHASE_WORDS)
-        self._blinks = Blinks()
+        self.blinks = Blinks()
         self._programs = Programs()
         self._live_x_q28 = words(LIVES_MAX)
         self._live_w_q28 = words(LIVES_MAX)
         self._hold_target_q28 = words(DOFS_MAX)
         self._hold_x_q28 = words(DOFS_MAX)
         self._hold_w_q28 = words(DOFS_MAX)
-        self._hold_q15 = halves(DOFS_MAX)
+        self.hold_q15 = halves(DOFS_MAX)
         self._value_q15 = halves(MAPPINGS_MAX)
         self._wanted = bytearray(DOFS_MAX)
         self._weight_sum = words(DOFS_MAX)
         self._shift = bytearray(DOFS_MAX)
         self._upper = words(DOFS_MAX)
         self._lower = words(DOFS_MAX)
+        self.live_state = (self.live_target_q28, self._live_x_q28, self._live_w_q28)
+        self.hold_state = (self._hold_target_q28, self._hold_x_q28, self._hold_w_q28)
+        self.exchange = Exchange(self)
+        self._exchange_due = False
+        self._tempos_changed = 0
 
     def commit(self):
-        """Exchange the staged tables for those that play. Call it while the motion stands, with a complete set."""
-        self.tables, self.staged = self.staged, self.tables
-        self.staged.ready = False
-        tables = self.tables
-        noise = (tables.seed, tables.spread_q15)
-        if noise != self._drawn:
-            functions.fill_gradients(self._gradients, tables.seed, tables.spread_q15)
-            self._drawn = noise
-        tables.link_repeats()
-        self.motor.load(tables)
-        self._rest()
+        """Let the staged tables, which are complete, replace those that play: now, or when the motion runs, soon."""
+        self.exchange.begin()
+        if self.frame < 0:
+            while not self.exchange.prepare():
+                pass
+            self.exchange.replace()
+            self._rest()
 
     def start(self):
         """Begin the motion anew: frame 0 is due now. Targets that wait keep their stamps."""
@@ -82,6 +83,7 @@ class Puppet:
         self.frame = 0
         self.frame_max_us = 0
         self.cues.counts[0] = 0
+        self.motor.begin()
         self.clock.start(self._board.ticks_us(), self.tables.frame_rate_hz)
 
     def stop(self):
@@ -90,11 +92,25 @@ class Puppet:
             self.motor.stand()
         self.frame = -1
         self.cues.clear()
+        if self.exchange.step >= 0:
+            self._exchange_due = False
+            self.commit()
+
+    def prepare(self):
+        """Take a step of what an exchange of tables needs before the next frame; return whether there was one to take."""
+        if self.exchange.step < 0 or self._exchange_due:
+            return False
+        self._exchange_due = self.exchange.prepare()
+        return True
 
     def step(self, silent):
         """Compute the frame that is due and bring it to the motors; `silent` tells that the link is quiet."""
         begun_us = self._board.ticks_us()
         self.clock.begin(begun_us)
+        if self._exchange_due:
+            self._exchange_due = False
+            self.exchange.carry_over()
+            self._tempos_changed = 1
         self._synthesise()
         self.motor.move(self.signal_q15, silent)
         self.actions.warp(self.tables, self.tempo_q16[0], self.clock.rate_hz)
@@ -110,7 +126,8 @@ class Puppet:
         a = self.actions
         rate_hz = self.clock.rate_hz
         counts = self.cues.counts
-        counts[1] = 0
+        counts[1] = self._tempos_changed
+        self._tempos_changed = 0
         self.cues.apply(self.frame, a.target_q28, self.live_target_q28, self.tempo_q16, a.wanted_tempo_q16)
         a.compute_phases(t, self._master, rate_hz)
         if counts[1]:
@@ -118,11 +135,11 @@ class Puppet:
         a.end_gestures(t)
         compositor.hold_targets(
             t.actions, a.target_q28, t.first_mapping, t.mapping_count, t.mapped_dof,
-            t.dofs, t.relative, self.base_q15, self._hold_target_q28, self._hold_w_q28, self._hold_q15, self._wanted,
+            t.dofs, t.relative, self.base_q15, self._hold_target_q28, self._hold_w_q28, self.hold_q15, self._wanted,
         )
         for n in range(a.enter(t, self._master, rate_hz)):
             if a.risen[n] >= 128:
-                self._blinks.enter(t, a.risen[n] & 127)
+                self.blinks.enter(t, a.risen[n] & 127)
         weights.integrate(t.actions, a.target_q28, a.x_q28, a.w_q28, t.rise_q26, t.fall_q26)
         weights.integrate(
             t.lives, self.live_target_q28, self._live_x_q28, self._live_w_q28, t.live_rise_q26, t.live_fall_q26
@@ -132,17 +149,17 @@ class Puppet:
         )
         functions.evaluate(
             a.playing, a.found, a.cycle, a.fraction_q24, t.first_mapping, t.mapping_count, t.function,
-            t.argument, t.same, self._sine, self._gradients, self._live_w_q28, t.curve_start, t.curve_samples,
+            t.argument, t.same, self._sine, self.gradients, self._live_w_q28, t.curve_start, t.curve_samples,
             t.samples_q15, self._value_q15,
         )
         if t.programs:
-            self._programs.evaluate(t, a, self._sine, self._gradients, self._live_w_q28, self._value_q15)
+            self._programs.evaluate(t, a, self._sine, self.gradients, self._live_w_q28, self._value_q15)
         if t.blinks:
-            self._blinks.evaluate(t, a, self._sine, self._value_q15)
+            self.blinks.evaluate(t, a, self._sine, self._value_q15)
         functions.repeat(a.playing, a.found, t.first_mapping, t.mapping_count, t.same, self._value_q15)
         compositor.blend(
             a.playing, a.found, a.w_q28, t.first_mapping, t.mapping_count, t.mapped_dof, t.low_q15, t.high_q15,
-            self._value_q15, t.dofs, self._hold_w_q28, self._hold_q15, self.base_q15,
+            self._value_q15, t.dofs, self._hold_w_q28, self.hold_q15, self.base_q15,
             self._weight_sum, self._shift, self._upper, self._lower,
         )
     # fmt: on
@@ -151,14 +168,15 @@ class Puppet:
         """Set the state before frame 0: no action, HOLD and live channels at rest, tempo 1, phase 0."""
         tables = self.tables
         self.frame = -1
+        self._tempos_changed = 0
         self.tempo_q16[0] = TEMPO_ONE
         for place in range(clock.PHASE_WORDS):
             self._master[place] = 0
         self.actions.rest(tables)
-        self._blinks.seed(tables)
+        self.blinks.rest(tables)
         for live in range(tables.lives):
             rest_q28 = tables.live_rest_q28[live]
             self.live_target_q28[live] = self._live_x_q28[live] = self._live_w_q28[live] = rest_q28
         for dof in range(tables.dofs):
             self._hold_target_q28[dof] = self._hold_x_q28[dof] = self._hold_w_q28[dof] = WEIGHT_ONE
-            self._hold_q15[dof] = self.base_q15[dof] = tables.rest_q15[dof]
+            self.hold_q15[dof] = self.base_q15[dof] = tables.rest_q15[dof]

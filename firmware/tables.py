@@ -28,6 +28,7 @@ from shared.formats import (
     KIND_RELATIVE,
     LIVES_MAX,
     MAPPINGS_MAX,
+    NEW,
     NO_PIN,
     NOISE_TABLES,
     PULSE_BITS,
@@ -71,6 +72,10 @@ class Tables:
         self.seed = 0
         self.spread_q15 = 0
         self.link_timeout_ms = 500
+        # what each action, DOF and live channel was in the tables that play
+        self.keep_action = bytearray(ACTIONS_MAX)
+        self.keep_dof = bytearray(DOFS_MAX)
+        self.keep_live = bytearray(LIVES_MAX)
         self._forget_seen()
         # per DOF
         self.relative = bytearray(DOFS_MAX)
@@ -157,6 +162,9 @@ class Tables:
     def _forget_seen(self):
         self._dofs_seen = self._actions_seen = self._mappings_seen = self._lives_seen = 0
         self._curves_seen = self._programs_seen = self._blinks_seen = 0
+        for keep in (self.keep_action, self.keep_dof, self.keep_live):
+            for place in range(len(keep)):
+                keep[place] = NEW
         self._samples_used = self._samples_end = self._words_used = self._words_end = 0
 
     def dof(self, dof, kind, rest_q15, low_q15, high_q15):
@@ -324,17 +332,26 @@ class Tables:
         self._blinks_seen += 1
         return None
 
-    def link_repeats(self):
-        """Note for every mapping which one before it in its action has the same function: that is evaluated once."""
-        for action in range(self.actions):
-            first = self.first_mapping[action]
-            for mapping in range(first, first + self.mapping_count[action]):
-                self.same[mapping] = mapping
-                function = self.function[mapping]
-                for other in range(first, mapping if function < FUNCTION_BLINK else first):
-                    if self.function[other] == function and self.argument[other] == self.argument[mapping]:
-                        self.same[mapping] = other
-                        break
+    def link_repeats(self, action):
+        """Note for an action's mappings which one before has the same function: that is evaluated once."""
+        first = self.first_mapping[action]
+        for mapping in range(first, first + self.mapping_count[action]):
+            self.same[mapping] = mapping
+            function = self.function[mapping]
+            for other in range(first, mapping if function < FUNCTION_BLINK else first):
+                if self.function[other] == function and self.argument[other] == self.argument[mapping]:
+                    self.same[mapping] = other
+                    break
+
+    def keep(self, kind, first, place, old):
+        """Note that what is new at `first + place` was `old` in the tables that play, or NEW; it is field 2 and up."""
+        keep = (self.keep_action, self.keep_dof, self.keep_live)
+        if kind >= len(keep):
+            return 0
+        if first + place >= (self.actions, self.dofs, self.lives)[kind]:
+            return 1
+        keep[kind][first + place] = old
+        return None
 
     def live(self, live, rest_q28, rise_q26, fall_q26):
         """Store a live channel."""

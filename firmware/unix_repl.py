@@ -1,9 +1,9 @@
 """The REPL that a Pico has and MicroPython's unix port lacks: raw mode for programs, and a plain friendly one.
 
 Input comes over the board's link; output is what is printed, which the host sends on. Ctrl-A enters raw mode, Ctrl-B
-leaves it, Ctrl-C drops the line, Ctrl-D carries out what was sent in raw mode, and begins the firmware anew in friendly
-mode or where raw mode has nothing to carry out before Ctrl-B. Raw paste mode is refused, as programs that know it
-expect of those that do not.
+leaves it (on an empty line), Ctrl-C drops the line, Ctrl-D carries out what was sent in raw mode, and begins the
+firmware anew in friendly mode or where raw mode has nothing to carry out before Ctrl-B. Raw paste mode is refused, as
+programs that know it expect of those that do not.
 """
 
 import sys
@@ -15,6 +15,19 @@ _PASTE_REQUEST = b"\x05A"
 _WAIT_US = const(1000000)
 
 
+class _Reset(BaseException):
+    """What `machine.reset()` raises here: the REPL's end."""
+
+
+class _Machine:
+    """As much of the module `machine` as mpremote needs to reset an MCU."""
+
+    @staticmethod
+    def reset():
+        """Begin the firmware anew."""
+        raise _Reset
+
+
 class Repl:
     """A REPL over a board's link."""
 
@@ -22,19 +35,26 @@ class Repl:
         self._board = board
         self._byte = bytearray(1)
         self._names = {"__name__": "__main__"}
+        sys.modules["machine"] = _Machine()
 
     def run(self):
-        """Serve until Ctrl-D in friendly mode."""
+        """Serve until Ctrl-D in friendly mode, or `machine.reset()`."""
+        try:
+            self._serve()
+        except _Reset:
+            pass
+
+    def _serve(self):
         raw = False
         line = bytearray()
         print("\r\n>>> ", end="")
         while True:
             byte = self._read()
-            if byte == 1:
+            if byte == 1 and (raw or not line):
                 raw = True
                 line = bytearray()
                 print(_RAW_BANNER, end="")
-            elif byte == 2:
+            elif byte == 2 and (raw or not line):
                 raw = False
                 line = bytearray()
                 print("\r\nMicroPython on a PC, Marotte\r\n>>> ", end="")
@@ -44,7 +64,7 @@ class Repl:
                     print("\r\n>>> ", end="")
             elif raw:
                 line = self._raw(byte, line)
-            elif byte == 4:
+            elif byte == 4 and not line:
                 print("\r\nMPY: soft reboot\r\n", end="")
                 return
             else:
@@ -85,8 +105,9 @@ class Repl:
             if line:
                 print("\b \b", end="")
             return line[:-1]
-        line.append(byte)
-        print(chr(byte), end="")
+        if byte >= 32:
+            line.append(byte)
+            print(chr(byte), end="")
         return line
 
     def _run(self, source, mode):

@@ -68,6 +68,10 @@ CYCLES_MAX = 1000  # of a gesture
 KIND_ABSOLUTE = 0
 KIND_RELATIVE = 1
 
+NEW = 255  # in `keep`: an action, DOF or live channel that was not there before
+KEEP_ACTIONS = 0  # kinds of `keep`
+KEEP_DOFS = 1
+KEEP_LIVES = 2
 FRAME_NOW = -1  # stamp of a target that acts in the next frame, whichever it is
 MASTER = 255  # the `action` of a tempo message that means the master tempo
 NO_PIN = 255  # the `pin` of a DOF that drives nothing

@@ -43,16 +43,11 @@ class LinkSilent(LinkError):
 class LinkRefused(LinkError):
     """The MCU refused a command. `status` and `detail` are those of its acknowledgement."""
 
-    def __init__(self, text: str, status: int, detail: int):
-        super().__init__(text)
+    def __init__(self, name: str, status: int, detail: int):
+        text = messages.STATUS_TEXT[status] if status < len(messages.STATUS_TEXT) else f"status {status}"
+        super().__init__(f"the MCU refused {name!r}: {text} (detail {detail})")
         self.status = status
         self.detail = detail
-
-
-def refusal(name: str, status: int, detail: int) -> LinkRefused:
-    """Return the error for a message that the MCU refused."""
-    text = messages.STATUS_TEXT[status] if status < len(messages.STATUS_TEXT) else f"status {status}"
-    return LinkRefused(f"the MCU refused {name!r}: {text} (detail {detail})", status, detail)
 
 
 class Carrier(Protocol):
@@ -171,6 +166,11 @@ class Link:
         """How many commands are not acknowledged yet."""
         return len(self._backlog) + len(self._under_way)
 
+    @property
+    def tail(self) -> bytes:
+        """The last bytes that have come and are no packet yet, at most 1 KB of them."""
+        return self._partial
+
     def post(
         self,
         name: str,
@@ -261,7 +261,7 @@ class Link:
         if status == messages.OK:
             return
         if command.on_refused is None:
-            self._refusals.append(refusal(command.name, status, detail))
+            self._refusals.append(LinkRefused(command.name, status, detail))
             return
         command.on_refused(status, detail)
 

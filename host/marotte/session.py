@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from functools import partial
 
-from marotte.link import Carrier, Link, LinkError, LinkRefused, LinkSilent, Message, refusal
+from marotte.link import Carrier, Link, LinkError, LinkRefused, LinkSilent, Message
 from marotte.puppet import Puppet
 from marotte.tables import Tables, items_per_message, keeps
 from shared import codec, messages
@@ -51,10 +51,11 @@ class Session:
         self._posted_us = carrier.now_us()
 
     def open(self, timeout_s: float = OPEN_TIMEOUT_S) -> None:
-        """Greet the MCU. Raises LinkSilent if nothing answers in time, LinkForeign if something else does."""
+        """Greet the MCU, at first or again. Raises LinkSilent if nothing answers in time, LinkForeign if something else does."""
         carrier = self.carrier
         end_us = carrier.now_us() + round(timeout_s * 1e6)
         refused: list[int] = []
+        self.welcome = {}
         while not self.welcome:
             if carrier.now_us() >= end_us:
                 raise self._no_welcome(timeout_s)
@@ -81,13 +82,17 @@ class Session:
         """
         self.stop()
         parts = list(tables.messages())
+        refused: list[LinkRefused] = []
         for name, fields, items in parts:
-            self._post(name, fields, items)
+
+            self._post(name, fields, items, partial(_note_refusal, refused, name))
         end_us = self.carrier.now_us() + round(UPLOAD_TIMEOUT_S * 1e6)
         while self.link.pending:
             self._step(end_us, "the puppet's tables were not acknowledged")
             if progress:
                 progress(max(0, len(parts) - self.link.pending), len(parts))
+        if refused:
+            raise refused[0]
 
     def exchange(self, tables: Tables, playing: Puppet) -> None:
         """Replace the tables of a puppet that moves, at the beginning of a frame.
@@ -205,10 +210,15 @@ class Session:
             self._status = message.fields
 
     def _no_welcome(self, timeout_s: float) -> LinkError:
+        if b">>>" in self.link.tail or b"raw REPL" in self.link.tail:
+            return LinkForeign(
+                "MicroPython's REPL answers at this port, not Marotte's firmware: reset the MCU, "
+                "for example with `mpremote reset`; if that does not help, flash the firmware"
+            )
         if self.link.counters.bytes:
             return LinkForeign("what answers at this port is not Marotte's firmware; flash it, or choose another port")
         return LinkSilent(f"no answer within {timeout_s:g} s: is the firmware running on the MCU?")
 
 
 def _note_refusal(refused: list[LinkRefused], name: str, status: int, detail: int) -> None:
-    refused.append(refusal(name, status, detail))
+    refused.append(LinkRefused(name, status, detail))

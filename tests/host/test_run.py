@@ -146,11 +146,14 @@ def test_run_again_on_a_puppet_that_is_still_moving(pet, mcu):
 def test_run_command_ends_with_its_outputs_off(number):
     command = [sys.executable, "-u", "-m", "marotte", "run", *PET, *ROBOT, "--mcu", "unix", "--no-view"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert re.match(r"pet uploaded in \d+ ms, on emulated unix at /dev/\S+\n", process.stdout.readline())
-        assert process.stdout.readline() == "   0.00 s  TIRED, mood WEARY\n"
-        assert process.stdout.readline().endswith("CALM, mood EVEN\n")
-        os.kill(process.pid, number)
-        out, err = process.communicate(timeout=10)
+        try:
+            assert re.match(r"pet uploaded in \d+ ms, on emulated unix at /dev/\S+\n", process.stdout.readline())
+            assert process.stdout.readline() == "   0.00 s  TIRED, mood WEARY\n"
+            assert process.stdout.readline().endswith("CALM, mood EVEN\n")
+            os.kill(process.pid, number)
+            out, err = process.communicate(timeout=10)
+        finally:
+            process.kill()
     assert (process.returncode, err) == (130, "")
     assert re.search(r"stopped by hand: \d+ frames, 0 late, at most \d+ us; outputs are off", out)
     assert re.search(r"HEAD_YAW +GP6 +\d+ +1[45]\d\d\.\d us", out)
@@ -161,9 +164,12 @@ def test_run_command_plays_on_a_port_served_by_the_mcu_command():
     with subprocess.Popen(serve, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
         url = re.search(r"socket://\S+", server.stdout.readline())[0]
         command = [sys.executable, "-m", "marotte", "run", *PET, "--port", url, "--seconds", "1"]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=20)
-        os.kill(server.pid, signal.SIGINT)
-        _, err = server.communicate(timeout=10)
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+            os.kill(server.pid, signal.SIGINT)
+            _, err = server.communicate(timeout=10)
+        finally:
+            server.kill()
     assert (done.returncode, done.stderr) == (0, "")
     assert re.search(r"played: 3\d frames, 0 late", done.stdout)
     assert (server.returncode, err) == (130, "")

@@ -4,7 +4,7 @@ import math
 from fractions import Fraction
 
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from shared.formats import ALPHA_BITS, SNAP_Q28, WEIGHT_MAX, WEIGHT_ONE
@@ -25,8 +25,19 @@ def integrate(target, x, w, rise, fall):
     return arrays[1][0], arrays[2][0]
 
 
-@given(weights_q28, weights_q28, weights_q28, alphas_q26, alphas_q26)
-def test_weights_follow_the_two_filters(target, x, w, rise, fall):
+@st.composite
+def states(draw):
+    """A target, and where the two filters stand: anywhere, or about as near to it as the snap reaches."""
+    target, x, w = draw(st.tuples(weights_q28, weights_q28, weights_q28))
+    if draw(st.booleans()):
+        x, w = (min(max(target + draw(st.integers(-4 * SNAP_Q28, 4 * SNAP_Q28)), 0), WEIGHT_MAX) for _ in range(2))
+    return target, x, w
+
+
+@given(states(), alphas_q26, alphas_q26)
+@example((0, 2000, 1 << 20), 1, 1 << 25)  # x snaps in this frame, after w has followed it
+def test_weights_follow_the_two_filters(state, rise, fall):
+    target, x, w = state
     alpha = Fraction(rise if target > x else fall, 1 << ALPHA_BITS)
     expected_x = x + (target - x) * alpha
     found_x, found_w = integrate(target, x, w, rise, fall)

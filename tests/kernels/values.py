@@ -11,7 +11,9 @@ ALPHA_LAST = formats.ALPHA_ONE - 1
 
 def integers(least, greatest, *others):
     """Integers of a range in which the ends, and others of interest, come up often."""
-    ends = sorted({least, least + 1, greatest - 1, greatest, *others})
+    ends = sorted(
+        number for number in {least, least + 1, greatest - 1, greatest, *others} if least <= number <= greatest
+    )
     return st.sampled_from(ends) | st.integers(least, greatest)
 
 

@@ -86,7 +86,7 @@ def test_other_bytes_call_for_nothing(performing, data):
 
 
 def test_firmware_performs_again_after_the_repl(performing):
-    mcu, session = performing
+    mcu, _ = performing
     repl = RawRepl(mcu)
     assert repl.exec("print('here')").strip() == "here"
     assert mcu.edges(2)[-1][1] == 0

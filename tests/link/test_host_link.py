@@ -210,14 +210,21 @@ def test_session_with_nobody_says_so_within_two_seconds():
 
 @pytest.mark.parametrize(
     "answer",
-    [b">>> \r\n>>> ", b"\0" * 40, bytes(range(256)), ack(0)[:-2] + b"\0", wire_packet(0x55, 0, b"hello")],
-    ids=["a REPL", "zeros", "all bytes", "a damaged packet", "packets of others"],
+    [b"login: ", b"\0" * 40, bytes(range(256)), ack(0)[:-2] + b"\0", wire_packet(0x55, 0, b"hello")],
+    ids=["a computer", "zeros", "all bytes", "a damaged packet", "packets of others"],
 )
 def test_session_with_something_else_says_so_within_two_seconds(answer):
     carrier = ScriptedCarrier(lambda *_: (answer, DELAY_US))
     with pytest.raises(LinkForeign, match="not Marotte's firmware"):
         Session(carrier).open()
     assert carrier.now_us() <= OPEN_TIMEOUT_S * 1e6 + 2 * STEP_US
+
+
+@pytest.mark.parametrize("answer", [b"\r\n>>> ", b"raw REPL; CTRL-B to exit\r\n>"])
+def test_session_with_a_repl_says_how_to_get_the_firmware(answer):
+    carrier = ScriptedCarrier(lambda *_: (answer, DELAY_US))
+    with pytest.raises(LinkForeign, match=r"MicroPython's REPL answers at this port.*`mpremote reset`"):
+        Session(carrier).open()
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,8 @@
 """A day of the pet: all 2 592 000 frames of 24 h one after another, none sought or skipped, against the reference.
 
 The pet plays its score at each full hour; between them it goes through its behaviours and moods. Every 19th frame is
-compared, and the last one, whose number is a multiple of 19. `make test` plays the first ten minutes.
+compared, and the last one, whose number is a multiple of 19. `make test` plays the first ten minutes; `make soak` plays the
+day, and a day of some random puppets, whose cues come in the first minute and whose phases go far.
 """
 
 import time
@@ -17,7 +18,7 @@ from marotte.mcu.unix import UnixMcu
 from marotte.prompter import Prompter
 from shared.formats import TAP_BASE
 from tests.motion.bounds import fractions_of_bound
-from tests.motion.playing import Case, load
+from tests.motion.playing import Case, load, random_case
 from tests.reference import checkpoints
 
 PUPPETS = Path(__file__).parents[2] / "puppets"
@@ -82,11 +83,23 @@ def test_ten_minutes_of_the_pet_keep_the_bounds():
 
 @pytest.mark.soak
 def test_a_day_of_the_pet_keeps_the_bounds(capsys):
+    assert_long_run_is_right(pet_for(DAY_FRAMES), DAY_FRAMES, capsys)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", [10, 11, 12])
+def test_a_day_of_a_random_puppet_keeps_the_bounds(seed, capsys):
+    case = random_case(seed, 60, dofs=5, actions=8)
+    frames = 24 * HOUR_S * case.puppet.get("frame_rate", FRAME_RATE_HZ)
+    assert_long_run_is_right(case, frames - (frames - 1) % TAPS_EVERY, capsys)
+
+
+def assert_long_run_is_right(case, frames, capsys):
     begun_s = time.monotonic()
-    compared, worst, status = play_and_compare(pet_for(DAY_FRAMES), DAY_FRAMES)
+    compared, worst, status = play_and_compare(case, frames)
     with capsys.disabled():
         print(
-            f"\na day of the pet: {DAY_FRAMES} frames, {compared} of them compared, worst error {worst:.3f} of its bound, "
+            f"\na day of {case.name}: {frames} frames, {compared} of them compared, worst error {worst:.3f} of its bound, "
             f"{status['late_targets']} late targets, in {time.monotonic() - begun_s:.0f} s"
         )
     assert (status["late_targets"], status["late_frames"], status["damaged"]) == (0, 0, 0)

@@ -51,13 +51,15 @@ class LiveMcu:
         self._start_s = time.monotonic()
         self._waiting = b""
         self._host_reads = True
+        self._ended = threading.Event()
         self._stop_receiver, self._stop_sender = socket.socketpair()
         self._thread = threading.Thread(target=self._run, name="live MCU", daemon=True)
         self._thread.start()
 
     def wait(self, timeout_s: float | None = None) -> None:
         """Wait until the MCU fails or is closed, or for so long. Raises MarotteError if it has failed."""
-        self._thread.join(timeout_s)
+        # Not by joining the thread: a join that Ctrl-C interrupts makes the next one believe that the thread has ended.
+        self._ended.wait(timeout_s)
         if self.error:
             raise self.error
 
@@ -83,6 +85,8 @@ class LiveMcu:
         except MarotteError as error:
             self.error = error
             self._endpoint.close()
+        finally:
+            self._ended.set()
 
     def _real_us(self) -> int:
         return int((time.monotonic() - self._start_s) * 1e6 * self._speed) - self.lag_us

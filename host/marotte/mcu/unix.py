@@ -172,6 +172,9 @@ class UnixMcu(VirtualMcu):
         elif kind == b"Q":
             for model in self._pins.values():
                 model.quiet(at_us * 1000)
+        elif kind == b"R":
+            if data[0] in self._pins:
+                self._pins[data[0]].quiet(at_us * 1000)
         else:
             for pin, pulse_q4us in struct.iter_unpack("<BH", data):
                 model = self._pins.setdefault(pin, _PwmPin(at_us * 1000))

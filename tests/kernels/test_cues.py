@@ -1,0 +1,142 @@
+"""The queue of stamped targets: what is stored, what is refused, and what acts in which frame."""
+
+import struct
+from typing import NamedTuple
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared import formats
+from tests.checked import load_checked
+from tests.kernels.values import integers, words
+
+MODULE = load_checked("firmware/cues.py")
+ROOM = 8
+LATEST_FRAME = (1 << 31) - 1
+NOW = 128
+
+# What the firmware lets through, by kind of target: first index, number of indices, least and greatest value.
+LIMITS = {
+    MODULE.WEIGHT: (0, formats.ACTIONS_MAX, 0, formats.WEIGHT_MAX),
+    MODULE.LIVE: (0, formats.LIVES_MAX, 0, formats.WEIGHT_ONE),
+    MODULE.TEMPO: (formats.MASTER, 1, formats.MASTER_TEMPO_MIN_Q16, formats.MASTER_TEMPO_MAX_Q16),
+}
+
+
+class Target(NamedTuple):
+    """One entry of the queue."""
+
+    frame: int
+    kind: int
+    index: int
+    value: int
+
+
+class Queue:
+    """The arrays of a queue that holds some targets already."""
+
+    def __init__(self, targets=()):
+        columns = zip(*targets, strict=True) if targets else ((), (), (), ())
+        frames, kinds, indices, values = ([*column, *[0] * (ROOM - len(targets))] for column in columns)
+        self.arrays = words(frames), bytearray(kinds), bytearray(indices), words(values)
+
+    def targets(self, count):
+        return [Target(*entry) for entry in zip(*self.arrays, strict=True)][:count]
+
+
+def put(stamp, items, kind, limits, before=()):
+    """Return (result, targets behind those before) of a payload."""
+    payload = struct.pack("<I", stamp) + b"".join(struct.pack("<BI", *item) for item in items)
+    queue = Queue(before)
+    result = MODULE._put(b"\xee\xee" + payload, 2, len(items), kind, *limits, *queue.arrays, len(before))
+    count = len(before) + len(items)
+    assert queue.targets(len(before)) == list(before)
+    return result, queue.targets(count)[len(before) :]
+
+
+stamps = integers(0, 0xFFFFFFFF, LATEST_FRAME, LATEST_FRAME + 1)
+kinds = st.sampled_from(list(LIMITS))
+
+
+@st.composite
+def payloads(draw):
+    """A stamp, items (index, value) and a kind; many within their limits."""
+    kind = draw(kinds)
+    first, indices, least, most = LIMITS[kind]
+    good = st.tuples(integers(first, first + indices - 1), integers(least, most))
+    wild = st.tuples(integers(0, 255), integers(0, 0xFFFFFFFF, most + 1, max(least - 1, 0), 1 << 31))
+    return draw(stamps), draw(st.lists(good, max_size=4) | st.lists(good | wild, max_size=4)), kind
+
+
+@given(payloads())
+def test_targets_are_stored_whole_or_refused_by_their_first_bad_field(payload):
+    stamp, items, kind = payload
+    first, indices, least, most = LIMITS[kind]
+    is_now = stamp == 0xFFFFFFFF
+    bad = [0] if stamp > LATEST_FRAME and not is_now else []
+    for n, (index, value) in enumerate(items):
+        bad += [1 + 2 * n] if not first <= index < first + indices else []
+        bad += [2 + 2 * n] if not least <= value <= most else []
+    result, stored = put(stamp, items, kind, LIMITS[kind], before=[Target(5, MODULE.WEIGHT, 1, 2)])
+    if bad:
+        assert result == bad[0]
+    else:
+        assert result == -1
+        frame, kind = (0, kind | NOW) if is_now else (stamp, kind)
+        assert stored == [Target(frame, kind, *item) for item in items]
+
+
+queued = st.builds(
+    Target,
+    integers(0, LATEST_FRAME, 99, 100, 101),
+    st.sampled_from([MODULE.WEIGHT, MODULE.LIVE, MODULE.WEIGHT | NOW, MODULE.LIVE | NOW]),
+    st.integers(0, 3),
+    integers(0, formats.WEIGHT_MAX),
+) | st.builds(
+    Target,
+    integers(0, LATEST_FRAME, 99, 100, 101),
+    st.sampled_from([MODULE.TEMPO, MODULE.TEMPO | NOW]),
+    st.just(formats.MASTER),
+    integers(formats.MASTER_TEMPO_MIN_Q16, formats.MASTER_TEMPO_MAX_Q16),
+)
+
+
+@given(st.lists(queued, max_size=ROOM), integers(0, LATEST_FRAME, 100), st.integers(0, 10))
+def test_targets_act_in_their_frame_in_order_and_the_rest_waits(targets, frame, late_before):
+    queue = Queue(targets)
+    weights, lives, tempo, late = words([-1] * 4), words([-2] * 4), words([-3]), words([late_before])
+    count = MODULE._apply(frame, len(targets), *queue.arrays, weights, lives, tempo, late)
+
+    due = [target for target in targets if target.frame <= frame]
+    assert queue.targets(count) == [target for target in targets if target.frame > frame]
+    assert late[0] == late_before + sum(target.frame < frame and not target.kind & NOW for target in due)
+    expected = {MODULE.WEIGHT: [-1] * 4, MODULE.LIVE: [-2] * 4, MODULE.TEMPO: [-3]}
+    for target in due:
+        kind = target.kind & ~NOW
+        expected[kind][0 if kind == MODULE.TEMPO else target.index] = target.value
+    assert [list(weights), list(lives), list(tempo)] == list(expected.values())
+
+
+@pytest.mark.parametrize(("frame", "acts"), [(99, False), (100, True), (101, True)])
+def test_target_acts_from_its_frame_on(frame, acts):
+    queue = Queue([Target(100, MODULE.WEIGHT, 2, 77)])
+    weights, late = words([0] * 4), words([0])
+    assert MODULE._apply(frame, 1, *queue.arrays, weights, words([0]), words([0]), late) == (not acts)
+    assert (weights[2], late[0]) == (77 * acts, int(frame > 100))
+
+
+def test_queue_refuses_what_does_not_fit_and_tells_its_room():
+    cues = MODULE.Cues()
+    payload = struct.pack("<i", 7) + struct.pack("<BI", 1, 2) * 40
+    body = b"\0\0" + payload
+    for n in range(6):
+        assert cues.put(MODULE.WEIGHT, body, 2, len(payload), 64) == 0
+        assert cues.count == 40 * (n + 1)
+    assert cues.put(MODULE.WEIGHT, body, 2, len(payload), 64) != 0
+    assert (cues.count, cues.detail) == (240, formats.QUEUE_MAX - 240)
+    assert cues.put(MODULE.WEIGHT, body, 2, 4 + 16 * 5, 64) == 0
+    assert cues.count == formats.QUEUE_MAX
+    weights = words([0] * 64)
+    cues.apply(7, weights, words([0]), words([0]))
+    assert (cues.count, weights[1]) == (0, 2)

@@ -1,0 +1,21 @@
+"""The whole firmware with every integer checked, 32 bits in kernels and small ones in what runs per frame: the motion stays."""
+
+import numpy
+import pytest
+
+from tests.corners import corners
+from tests.motion.checked_mcu import CheckedMcu
+from tests.motion.playing import TAPS, Case, play, random_case, tap
+
+CORNERS = [Case(*corner) for corner in corners() if corner.name in ("everything at once", "cues of one frame")]
+CASES = [(case, 4) for case in CORNERS] + [(random_case(seed, 4), 4) for seed in range(300, 303)]
+
+
+@pytest.mark.parametrize(("case", "seconds"), CASES, ids=[case.name for case, _ in CASES])
+def test_checked_firmware_moves_as_on_micropython(case, seconds):
+    expected = play(case, seconds, "unix")
+    with CheckedMcu() as mcu:  # its timer wraps on the way
+        found = play(case, seconds, mcu)
+    for name in TAPS:
+        assert numpy.array_equal(tap(found, name), tap(expected, name)), name
+    assert found.status["late_frames"] == 0
