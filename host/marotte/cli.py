@@ -15,10 +15,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from marotte import check, commands, emulated
+from marotte import check, commands, curves, emulated
 from marotte.errors import MarotteError
 from marotte.files import Watch, load
 from marotte.tomlfile import FileMistakes
+from shared import formats
 
 FINE = 0
 FAILURE = 1
@@ -56,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="marotte", description="Puppets that live on their own microcontroller, directed over a serial link."
     )
     commands_ = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_check, _add_render, _add_run, _add_ports, _add_mcu):
+    for add in (_add_check, _add_render, _add_run, _add_ports, _add_mcu, _add_import_curve):
         add(commands_)
     return parser
 
@@ -155,6 +156,31 @@ def _add_mcu(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     rp2040.add_argument("--flash", type=Path, metavar="FILE", help="a file that keeps the flash from run to run")
 
 
+def _add_import_curve(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands_,
+        "import-curve",
+        "print a curve of an animation tool as a function for a puppet file",
+        _import_curve,
+        "marotte import-curve nod.csv --column rotation_x --period 2 --name NOD >> puppets/pet.toml",
+        "marotte import-curve nod.csv --column rotation_x --period 2 --samples 32 --frame-rate 30",
+    )
+    parser.add_argument("file", metavar="FILE.csv", help="a CSV file whose first line names its columns")
+    parser.add_argument("--column", required=True, help="the column with the curve")
+    parser.add_argument("--period", type=_seconds, required=True, metavar="S", help="seconds after which it repeats")
+    parser.add_argument(
+        "--samples", type=_samples, metavar="N", help="2 to 256 (default: as many as rows, at most 256)"
+    )
+    parser.add_argument("--name", type=_function_name, help="what the function is called (default: like the column)")
+    parser.add_argument(
+        "--frame-rate",
+        type=_frame_rate,
+        metavar="F",
+        default=curves.FRAME_RATE_HZ,
+        help="frames a second, for a file that counts frames (default: %(default)g, as in Blender)",
+    )
+
+
 def _add_files(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("puppet", metavar="PUPPET", help="the puppet file")
     parser.add_argument("--score", required=True, help="the score file")
@@ -170,6 +196,28 @@ def _seconds(text: str) -> Fraction:
     if seconds is None or not 0 < seconds <= SECONDS_MAX:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a number of seconds above 0")
     return seconds
+
+
+def _frame_rate(text: str) -> float:
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = 0
+    if not 1 <= rate_hz <= curves.FRAME_RATE_MAX_HZ:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected frames a second, 1..{curves.FRAME_RATE_MAX_HZ}")
+    return rate_hz
+
+
+def _samples(text: str) -> int:
+    if not text.isdecimal() or len(text) > 3 or not 2 <= int(text) <= formats.SAMPLES_MAX:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number of samples, 2..{formats.SAMPLES_MAX}")
+    return int(text)
+
+
+def _function_name(text: str) -> str:
+    if not curves.is_function_name(text):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected letters, digits and _, and no primitive's name")
+    return text
 
 
 def _tcp_port(text: str) -> int:
@@ -213,6 +261,13 @@ def _run(options: argparse.Namespace) -> int:
 
 def _ports(options: argparse.Namespace) -> int:
     commands.list_ports()
+    return FINE
+
+
+def _import_curve(options: argparse.Namespace) -> int:
+    period_s = float(options.period)
+    curve = curves.import_curve(options.file, options.column, period_s, options.samples, options.frame_rate)
+    print(curve.text(options.name or curves.function_name(options.column)))
     return FINE
 
 

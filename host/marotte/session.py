@@ -84,7 +84,6 @@ class Session:
         parts = list(tables.messages())
         refused: list[LinkRefused] = []
         for name, fields, items in parts:
-
             self._post(name, fields, items, partial(_note_refusal, refused, name))
         end_us = self.carrier.now_us() + round(UPLOAD_TIMEOUT_S * 1e6)
         while self.link.pending:
