@@ -75,6 +75,8 @@ class Board:
         self._to_uart = False
         self._usb_poll = select.poll()
         self._usb_poll.register(sys.stdin, select.POLLIN)
+        self._usb_room = select.poll()
+        self._usb_room.register(sys.stdout, select.POLLOUT)
         self._poll = select.poll()
         self._poll.register(sys.stdin, select.POLLIN)
         self._poll.register(self._uart, select.POLLIN)
@@ -119,10 +121,15 @@ class Board:
         return count
 
     def send(self, buffer, length):
-        """Send the first `length` bytes of `buffer` to where the last bytes came from."""
+        """Send the first `length` bytes of `buffer` to where the last bytes came from.
+
+        A host that has stopped reading USB holds the caller up once, for a second at most; what follows is dropped
+        until it reads again: telemetry may be lost, and answers it will ask for again.
+        """
         if self._to_uart:
             self._uart.write(buffer, length)  # type: ignore[call-arg]  # the stub lacks the length
-        else:
+            return
+        for _ in self._usb_room.ipoll(0):
             self._stdout.write(buffer, length)
 
     def is_output(self, pin):
