@@ -6,8 +6,8 @@
 Neither Blender nor Bottango has a CSV format of its own, scripts write it, so this is what is assumed: the first line names the
 columns; cells are parted by commas, semicolons (numbers may then have decimal commas) or tabs. A column `time`, `seconds` or `t`
 holds seconds, a column `frame` frames, which become seconds by their rate; without either the rows are spread evenly over the
-period. Rows may be samples of every frame or keyframes alone: between them the curve is straight. The period begins with the first
-row; rows after its end are left out, and the last one before it leads back to the first.
+period. Rows may be samples of every frame or keyframes alone: between them the curve is straight. The period begins with the
+first row; rows after its end are left out, and the last one before it leads back to the first.
 """
 
 from __future__ import annotations
