@@ -52,21 +52,18 @@ class Prompter:
             if self._waiting_targets + size > self._queue_max:
                 break
             step = self._steps.popleft()
-            self._send(step, step.frame)
+            self._send(step)
             self._waiting.append((step.frame, size))
             self._waiting_targets += size
             sent.append(step)
         return sent
 
-    def exchange(self, state: Step, steps: Sequence[Step]) -> None:
-        """Go on with the steps of another score that are after `state`, which holds as soon as it arrives.
+    def exchange(self, steps: Sequence[Step]) -> None:
+        """Go on with other steps. What has been sent still waits, and takes its room until its frames are over."""
+        self._steps = deque(steps)
 
-        What has been sent of the old score counts as waiting still, so that there is room whatever has become of it.
-        """
-        self._steps = deque(step for step in steps if step.frame > state.frame)
-        self._send(state, formats.FRAME_NOW)
-
-    def _send(self, step: Step, frame: int) -> None:
+    def _send(self, step: Step) -> None:
+        frame = step.frame
         if step.weights:
             self._session.weight_targets(frame, {index: weight_q28(target) for index, target in step.weights.items()})
         if step.lives:

@@ -12,9 +12,9 @@ from fractions import Fraction
 from marotte.errors import MarotteError
 from marotte.files import Files, Watch
 from marotte.link import Carrier, LinkRefused
-from marotte.prompter import Prompter
+from marotte.prompter import AHEAD_FRAMES, Prompter
 from marotte.puppet import Puppet
-from marotte.score import Score
+from marotte.score import Score, resumed
 from marotte.score import state as score_state
 from marotte.session import Session
 from marotte.tables import build_tables, value_of
@@ -163,11 +163,13 @@ class _Play:
         before = self.files.puppet
         was = score_state(self._steps, before, self.scene.frame)
         self._take(files)
-        state = score_state(self._steps, files.puppet, self.scene.frame)
+        now, *later = resumed(self._steps, files.puppet, self.scene.frame, self.scene.frame + AHEAD_FRAMES + 1)
         actions = list(before.actions)
-        untouched = [actions[index] for index in was.tempos if actions[index] in files.puppet.actions]
-        tempos = {files.puppet.action_index(name): files.puppet.actions[name].tempo for name in untouched}
-        self._prompter.exchange(replace(state, tempos={**tempos, **state.tempos}), self._steps)
+        cued = [actions[index] for index in was.tempos if actions[index] in files.puppet.actions]
+        tempos = {files.puppet.action_index(name): files.puppet.actions[name].tempo for name in cued}
+        self._prompter.exchange([replace(now, tempos={**tempos, **now.tempos}), *later])
+        if self._arm:
+            self.session.arm()  # for outputs that are new
 
     def _take(self, files: Files) -> None:
         """Take what is to be played from now on, from the frame that has been reached."""

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 
 from marotte.puppet import Puppet
 from marotte.puppet_file import MASTER_NAME, MASTER_TEMPO_RANGE, TEMPO_RANGE, gains, weights
 from marotte.tomlfile import Document, FileMistakes, Mistake, Table, did_you_mean
+from shared.formats import FRAME_NOW
 
 AT_MAX_S = 10_000_000
 """The latest time of a cue: some 115 days, whose frame still fits the wire at 60 frames a second."""
@@ -112,6 +113,16 @@ def state(steps: Sequence[Step], puppet: Puppet, frame: int) -> Step:
         if action.cycles is not None:
             del weights[index]
     return Step(frame, weights, lives, master_tempo, tempos)
+
+
+def resumed(steps: Sequence[Step], puppet: Puppet, frame: int, settled: int) -> list[Step]:
+    """Return what brings an MCU that has played something else to where the steps are in `frame`, and goes on from there.
+
+    Targets of what it has played before may still act until the frame before `settled`; in that one everything is set once more.
+    """
+    now = replace(state(steps, puppet, frame), frame=FRAME_NOW)
+    soon = [step for step in steps if frame < step.frame <= settled]
+    return [now, *soon, state(steps, puppet, settled), *(step for step in steps if step.frame > settled)]
 
 
 def load_score(path: str | Path, puppet: Puppet) -> Score:

@@ -100,14 +100,23 @@ class Session:
         phases, poses and values. The frame rate has to be the same. Raises LinkRefused if the MCU refuses a part; the old tables
         then play on.
         """
-        *parts, commit = tables.messages()
-        for group in ([*parts, *keeps(playing, tables.puppet)], [commit]):
-            refused: list[LinkRefused] = []
-            for message in group:
-                self._post(*message, on_refused=partial(_note_refusal, refused, message[0]))
-            self.flush(UPLOAD_TIMEOUT_S)
+        begin, *parts = tables.messages()
+        commit = parts.pop()
+        for group in ([begin, *parts, *keeps(playing, tables.puppet)], [commit]):
+            refused = self._post_all(group)
             if refused:
                 raise refused[0]
+        end_us = self.carrier.now_us() + round(UPLOAD_TIMEOUT_S * 1e6)
+        while self._post_all([begin]):  # refused as long as the exchange is being prepared
+            self._step(end_us, "the exchange of tables was not carried out")
+
+    def _post_all(self, group: list[tuple[str, dict[str, int], list[dict[str, int]]]]) -> list[LinkRefused]:
+        """Send commands, wait until all are answered; return what the MCU refused."""
+        refused: list[LinkRefused] = []
+        for name, fields, items in group:
+            self._post(name, fields, items, partial(_note_refusal, refused, name))
+        self.flush(UPLOAD_TIMEOUT_S)
+        return refused
 
     def start(self) -> None:
         """Begin the motion: frame 0 is due when the MCU takes this command."""

@@ -27,11 +27,6 @@ Message: TypeAlias = tuple[str, dict[str, int], list[dict[str, int]]]
 HOLD_TAU_S = 0.25
 """How HOLD, which takes over what no action moves, comes and goes."""
 
-KEEP_ACTIONS = 0
-KEEP_DOFS = 1
-KEEP_LIVES = 2
-NOT_KEPT = 255
-
 _MESSAGES = {name: (fields, items) for name, _, fields, items in messages.MESSAGES}
 
 
@@ -126,12 +121,12 @@ def keeps(playing: Puppet, new: Puppet) -> Iterator[Message]:
     """
     same_kind = [name for name, dof in new.dofs.items() if name in playing.dofs and playing.dofs[name].kind == dof.kind]
     for kind, old_names, names, going_on in (
-        (KEEP_ACTIONS, playing.actions, new.actions, new.actions),
-        (KEEP_DOFS, playing.dofs, new.dofs, same_kind),
-        (KEEP_LIVES, playing.lives, new.lives, new.lives),
+        (formats.KEEP_ACTIONS, playing.actions, new.actions, new.actions),
+        (formats.KEEP_DOFS, playing.dofs, new.dofs, same_kind),
+        (formats.KEEP_LIVES, playing.lives, new.lives, new.lives),
     ):
         old_index = {name: index for index, name in enumerate(old_names)}
-        items = [{"old": old_index.get(name, NOT_KEPT) if name in going_on else NOT_KEPT} for name in names]
+        items = [{"old": old_index.get(name, formats.NEW) if name in going_on else formats.NEW} for name in names]
         step = items_per_message("keep")
         for start in range(0, len(items), step):
             yield "keep", {"kind": kind, "first": start}, items[start : start + step]
