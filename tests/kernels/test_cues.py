@@ -99,31 +99,63 @@ queued = st.builds(
     st.sampled_from([MODULE.TEMPO, MODULE.TEMPO | NOW]),
     st.just(formats.MASTER),
     integers(formats.MASTER_TEMPO_MIN_Q16, formats.MASTER_TEMPO_MAX_Q16),
+) | st.builds(
+    Target,
+    integers(0, LATEST_FRAME, 99, 100, 101),
+    st.sampled_from([MODULE.TEMPO, MODULE.TEMPO | NOW]),
+    st.integers(0, 3),
+    integers(formats.TEMPO_MIN_Q16, formats.TEMPO_MAX_Q16),
 )
 
 
-@given(st.lists(queued, max_size=ROOM), integers(0, LATEST_FRAME, 100), st.integers(0, 10))
-def test_targets_act_in_their_frame_in_order_and_the_rest_waits(targets, frame, late_before):
+@given(st.lists(queued, max_size=ROOM), integers(0, LATEST_FRAME, 100), st.tuples(st.integers(0, 10), st.integers(0, 1)))
+def test_targets_act_in_their_frame_in_order_and_the_rest_waits(targets, frame, before):
     queue = Queue(targets)
-    weights, lives, tempo, late = words([-1] * 4), words([-2] * 4), words([-3]), words([late_before])
-    count = MODULE._apply(frame, len(targets), *queue.arrays, weights, lives, tempo, late)
+    weights, lives, master, tempos, counts = words([-1] * 4), words([-2] * 4), words([-3]), words([-4] * 4), words(before)
+    count = MODULE._apply(frame, len(targets), *queue.arrays, weights, lives, master, tempos, counts)
 
     due = [target for target in targets if target.frame <= frame]
     assert queue.targets(count) == [target for target in targets if target.frame > frame]
-    assert late[0] == late_before + sum(target.frame < frame and not target.kind & NOW for target in due)
-    expected = {MODULE.WEIGHT: [-1] * 4, MODULE.LIVE: [-2] * 4, MODULE.TEMPO: [-3]}
+    expected = [-1] * 4, [-2] * 4, [-4] * 4, [-3]
+    changes = 0
     for target in due:
         kind = target.kind & ~NOW
-        expected[kind][0 if kind == MODULE.TEMPO else target.index] = target.value
-    assert [list(weights), list(lives), list(tempo)] == list(expected.values())
+        if kind == MODULE.TEMPO and target.index == formats.MASTER:
+            expected[3][0] = target.value
+        else:
+            expected[[MODULE.WEIGHT, MODULE.LIVE, MODULE.TEMPO].index(kind)][target.index] = target.value
+            changes += kind == MODULE.TEMPO
+    assert (list(weights), list(lives), list(tempos), list(master)) == expected
+    late = sum(target.frame < frame and not target.kind & NOW for target in due)
+    assert list(counts) == [before[0] + late, before[1] + changes]
 
 
 @pytest.mark.parametrize(("frame", "acts"), [(99, False), (100, True), (101, True)])
 def test_target_acts_from_its_frame_on(frame, acts):
     queue = Queue([Target(100, MODULE.WEIGHT, 2, 77)])
-    weights, late = words([0] * 4), words([0])
-    assert MODULE._apply(frame, 1, *queue.arrays, weights, words([0]), words([0]), late) == (not acts)
-    assert (weights[2], late[0]) == (77 * acts, int(frame > 100))
+    weights, counts = words([0] * 4), words([0, 0])
+    rest = words([0]), words([0]), words([0])
+    assert MODULE._apply(frame, 1, *queue.arrays, weights, *rest, counts) == (not acts)
+    assert (weights[2], list(counts)) == (77 * acts, [int(frame > 100), 0])
+
+
+places = st.lists(st.integers(0, 3), max_size=4, unique=True).flatmap(
+    lambda kept: st.permutations([*kept, *[formats.NEW] * (4 - len(kept))])
+)
+
+
+@given(st.lists(queued, max_size=ROOM), places, places)
+def test_waiting_targets_follow_what_keeps_its_name_and_are_dropped_with_what_is_gone(targets, keep_action, keep_live):
+    queue = Queue(targets)
+    count = MODULE._renumber(len(targets), *queue.arrays, bytes(keep_action), 4, bytes(keep_live), 4)
+    expected = []
+    for target in targets:
+        keep = keep_live if target.kind & ~NOW == MODULE.LIVE else keep_action
+        if target.index == formats.MASTER:
+            expected.append(target)
+        elif target.index in keep:
+            expected.append(target._replace(index=keep.index(target.index)))
+    assert queue.targets(count) == expected
 
 
 def test_queue_refuses_what_does_not_fit_and_tells_its_room():
@@ -138,5 +170,5 @@ def test_queue_refuses_what_does_not_fit_and_tells_its_room():
     assert cues.put(MODULE.WEIGHT, body, 2, 4 + 16 * 5, 64) == 0
     assert cues.count == formats.QUEUE_MAX
     weights = words([0] * 64)
-    cues.apply(7, weights, words([0]), words([0]))
+    cues.apply(7, weights, words([0]), words([0]), words([0]))
     assert (cues.count, weights[1]) == (0, 2)

@@ -2,10 +2,11 @@
 
 import functools
 import math
+from fractions import Fraction
 
 import numpy
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from shared import formats
@@ -22,10 +23,11 @@ ERROR = 2.0**-14
 gradient_words = integers(0, 65535, 32768)
 
 
-def evaluate(phases, mappings, gradients=None, lives_q28=(0,) * formats.LIVES_MAX):
+def evaluate(phases, mappings, gradients=None, lives_q28=(0,) * formats.LIVES_MAX, curves=()):
     """Return the values of all mappings, a list for each action.
 
     `phases` are (cycle, fraction_q24) of the actions; every one has all the `mappings`, pairs (function, argument).
+    `curves` are at most two lists of samples.
     """
     count, width = len(phases), len(mappings)
     functions, arguments = zip(*mappings, strict=True)
@@ -39,9 +41,13 @@ def evaluate(phases, mappings, gradients=None, lives_q28=(0,) * formats.LIVES_MA
         bytes([width] * count),
         bytes(functions * count),
         halves(arguments * count),
+        halves(range(count * width)),
         SINE,
         halves(gradients or [0] * 16 * 256),
         words(lives_q28),
+        halves([0, *(len(curve) for curve in curves[:-1])]),
+        halves(map(len, curves)),
+        halves(sample for curve in curves for sample in curve),
         values,
     )
     assert all(0 <= value <= ONE for value in values)
@@ -92,6 +98,51 @@ def test_live_channels_are_rounded_and_end_at_one(lives_q28):
     assert found == [min(ONE, math.floor(lives_q28[channel] / 2**13 + 0.5)) for channel in channels]
 
 
+samples_q15 = st.lists(values_q15, min_size=2, max_size=formats.SAMPLES_MAX)
+
+
+@given(fractions_q24, samples_q15, samples_q15)
+@example((1 << 24) - 1, [0, ONE], [ONE, 0] * 128)
+@example((1 << 24) - 1, [ONE, 0] * 128, [0, ONE])
+def test_curves_are_linear_between_their_samples_and_lead_back_to_the_first(fraction_q24, first, second):
+    curves = first, second
+    found = evaluate([(9, fraction_q24)], [(formats.FUNCTION_CURVE, 0), (formats.FUNCTION_CURVE, 1)], curves=curves)
+    for value, samples in zip(found[0], curves, strict=True):
+        place = Fraction(fraction_q24, 1 << 24) * len(samples)
+        rest = place - math.floor(place)
+        a, b = samples[math.floor(place)], samples[math.floor(place + 1) % len(samples)]
+        exact = a + (b - a) * rest
+        # half a unit, what the place's 15 bits drop, and a rounding of the phase by 2^-23 for every sample
+        assert abs(value - exact) <= Fraction(1, 2) + 1 + Fraction(len(samples), 256)
+
+
+@pytest.mark.parametrize("count", [2, 3, 255, 256])
+def test_curve_is_continuous_at_its_end(count):
+    samples = [ONE, *[0] * (count - 1)]
+    places = [(1 << 24) - 1, (1 << 24) - 2, (1 << 24) - 3, 0, 1]
+    found = evaluate([(0, place) for place in places], [(formats.FUNCTION_CURVE, 0)], curves=[samples])
+    assert all(abs(value - ONE) <= 3 for (value,) in found)
+
+
+@given(st.lists(values_q15, min_size=1, max_size=8), st.data())
+def test_repeated_functions_take_the_value_of_the_one_before(values, data):
+    same = [data.draw(st.integers(0, m)) for m in range(len(values))]
+    same = [m if same[place] != place else place for m, place in enumerate(same)]
+    found = halves([7, *values, 9])
+    MODULE.repeat(bytes([1]), 1, halves([0, 1]), bytes([1, len(values)]), halves([0, *(m + 1 for m in same)]), found)
+    assert list(found) == [7, *(values[m] for m in same), 9]
+
+
+def test_repeated_functions_are_not_evaluated():
+    values = halves([7] * 2)
+    one = halves([0])
+    MODULE.evaluate(
+        b"\0", 1, one, words([1 << 22]), one, b"\2", b"\0\0", halves([0, 0]), halves([0, 0]), SINE, None, None, one, one,
+        None, values,
+    )  # fmt: skip
+    assert list(values) == [ONE, 0]
+
+
 def test_functions_of_one_action_share_its_phase_and_no_other():
     codes = [(formats.FUNCTION_RSIN, 0), (formats.FUNCTION_RCOS, 0), (formats.FUNCTION_CONST, 5)]
     found = evaluate([(0, 0), (0, 1 << 22), (0, 1 << 23)], codes)
@@ -102,7 +153,8 @@ def test_functions_of_one_action_share_its_phase_and_no_other():
 def drawn(seed, spread_q15):
     """Return the gradients of all tables, 16 lists of 256 numbers."""
     gradients = halves([0] * 16 * 256)
-    MODULE.fill_gradients(gradients, seed, spread_q15)
+    for k in range(1, 17):
+        MODULE.fill_gradients(gradients, k, seed, spread_q15)
     numbers = [(word - 32768) / 32768 for word in gradients]
     return [numbers[start : start + 256] for start in range(0, len(numbers), 256)]
 

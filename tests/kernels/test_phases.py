@@ -8,7 +8,17 @@ from hypothesis import strategies as st
 
 from shared.formats import CYCLES, PHASE_BITS
 from tests.checked import load_checked
-from tests.kernels.values import halves, integers, master_tempos_q16, rates_hz, tempos_q16, weights_q28, words
+from tests.kernels.values import (
+    cycles,
+    halves,
+    integers,
+    master_tempos_q16,
+    offsets_q28,
+    rates_hz,
+    tempos_q16,
+    weights_q28,
+    words,
+)
 
 CLOCK = load_checked(
     "firmware/clock.py",
@@ -18,6 +28,8 @@ ACTIONS = load_checked("firmware/actions.py")
 
 WHOLE_MODULUS = 1 << 28
 TICKS_MODULUS = 1 << 30
+UNIT = 1 << PHASE_BITS
+NO_OFFSET_Q28 = ACTIONS.ZERO_OFFSET_Q28
 
 
 @st.composite
@@ -44,25 +56,41 @@ def test_master_phase_advances_by_exactly_tempo_over_rate(state, tempo_q16):
     assert master_phase(rate_hz, after) == expected % WHOLE_MODULUS
 
 
+def phases(rate_hz, master, tempos, kept, offsets_q28):
+    """Return the phases of actions that all play, a list of (cycle, fraction_q24)."""
+    count = len(tempos)
+    cycle, fraction_q24 = halves([7] * count), words([7] * count)
+    arrays = words(tempos), halves(kept), words(NO_OFFSET_Q28 + offset for offset in offsets_q28), cycle, fraction_q24
+    ACTIONS._phases(bytes(range(count)), count, words(master), rate_hz, *arrays)
+    assert all(0 <= whole < CYCLES for whole in cycle) and all(0 <= part < UNIT for part in fraction_q24)
+    return list(zip(cycle, fraction_q24, strict=True))
+
+
 @given(masters(), st.lists(tempos_q16, min_size=1, max_size=64))
 def test_phases_are_the_exact_ones_to_2_to_the_minus_24(state, tempos):
     rate_hz, master = state
-    count = len(tempos)
-    cycle, fraction_q24 = halves([7] * count), words([7] * count)
-    playing = bytes(range(count))
-    ACTIONS.phases(playing, count, words(master), rate_hz, words(tempos), cycle, fraction_q24)
-    for i, tempo_q16 in enumerate(tempos):
+    found = phases(rate_hz, master, tempos, [0] * len(tempos), [0] * len(tempos))
+    for (cycle, fraction_q24), tempo_q16 in zip(found, tempos, strict=True):
         exact = Fraction(tempo_q16, 65536) * master_phase(rate_hz, master)
-        assert 0 <= cycle[i] < CYCLES and 0 <= fraction_q24[i] < 1 << PHASE_BITS
-        found = cycle[i] + Fraction(fraction_q24[i], 1 << PHASE_BITS)
-        assert 0 <= (exact - found) % CYCLES < Fraction(1, 1 << PHASE_BITS)
+        assert 0 <= (exact - cycle - Fraction(fraction_q24, UNIT)) % CYCLES < Fraction(1, UNIT)
+
+
+@given(masters(), st.lists(st.tuples(tempos_q16, cycles, offsets_q28), min_size=1, max_size=64))
+def test_phases_have_the_kept_cycles_and_the_offset_added(state, actions):
+    rate_hz, master = state
+    found = phases(rate_hz, master, *zip(*actions, strict=True))
+    for (cycle, fraction_q24), (tempo_q16, kept, offset_q28) in zip(found, actions, strict=True):
+        exact = Fraction(tempo_q16, 65536) * master_phase(rate_hz, master) + kept + Fraction(offset_q28, NO_OFFSET_Q28)
+        # below by less than a unit from the nominal phase; the offset is rounded by half a unit
+        excess = (exact - cycle - Fraction(fraction_q24, UNIT) + Fraction(1, 2 * UNIT)) % CYCLES
+        assert excess < Fraction(2, UNIT)
 
 
 def test_phases_are_those_of_the_playing_actions_alone():
     cycle, fraction_q24 = halves([9] * 4), words([9] * 4)
-    ACTIONS.phases(
-        bytes([1, 3]), 2, words([3, 0, 0]), 30, words([1 << 16, 1 << 17, 1 << 16, 1 << 15]), cycle, fraction_q24
-    )
+    tempos = words([1 << 16, 1 << 17, 1 << 16, 1 << 15])
+    arrays = tempos, halves([0] * 4), words([NO_OFFSET_Q28] * 4), cycle, fraction_q24
+    ACTIONS._phases(bytes([1, 3]), 2, words([3, 0, 0]), 30, *arrays)
     assert (list(cycle), list(fraction_q24)) == ([9, 6, 9, 1], [9, 0, 9, 1 << 23])
 
 
@@ -70,7 +98,7 @@ def test_phases_are_those_of_the_playing_actions_alone():
 def test_actions_play_with_a_target_or_a_weight_above_zero(entries):
     target, x, w = (words(column) for column in (zip(*entries, strict=True) if entries else ((), (), ())))
     playing = bytearray(64)
-    found = ACTIONS.select(len(entries), target, x, w, playing)
+    found = ACTIONS._select(len(entries), target, x, w, playing)
     assert list(playing[:found]) == [i for i, entry in enumerate(entries) if any(entry)]
 
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from shared import formats
 
 ALPHA_LAST = formats.ALPHA_ONE - 1
+HALF_CYCLE_Q28 = (1 << 27) + (1 << 18)  # and the margin of 1/1024 that tempo matching leaves
 
 
 def integers(least, greatest, *others):
@@ -24,6 +25,7 @@ tempos_q16 = integers(formats.TEMPO_MIN_Q16, formats.TEMPO_MAX_Q16, formats.TEMP
 master_tempos_q16 = integers(formats.MASTER_TEMPO_MIN_Q16, formats.MASTER_TEMPO_MAX_Q16, formats.TEMPO_ONE)
 rates_hz = integers(formats.FRAME_RATE_MIN_HZ, formats.FRAME_RATE_MAX_HZ, 30)
 cycles = integers(0, formats.CYCLES - 1)
+offsets_q28 = integers(-HALF_CYCLE_Q28, HALF_CYCLE_Q28, 0)
 fractions_q24 = integers(0, (1 << formats.PHASE_BITS) - 1, 1 << 22, 1 << 23, 3 << 22)
 
 
