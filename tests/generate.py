@@ -17,13 +17,14 @@ _CHANNELS = ("GAZE_YAW", "GAZE_PITCH", "SPEED", "TURN")
 _NOISES = tuple(f"noise{k}" for k in range(1, 17))
 
 
-def random_puppet(rng, level="core", dofs=None, actions=None):
+def random_puppet(rng, level="core", dofs=None, actions=None, gains=True):
     """Return a random puppet as `tomllib` would give it.
 
     Args:
         rng: a `random.Random`.
         level: `"core"` or `"full"`.
         dofs, actions: how many, 1..16 and 1..64; drawn where None, small numbers more often.
+        gains: whether moods of the `"full"` level have band gains.
     """
     dofs = dofs or rng.choice((1, 2, 3, 5, 10, 16, rng.randint(1, 16)))
     actions = actions or rng.choice((1, 2, 4, 8, 16, 64, rng.randint(1, 64)))
@@ -48,19 +49,22 @@ def random_puppet(rng, level="core", dofs=None, actions=None):
         for i in range(rng.randint(0, 4))
     }
     if level == "full":
-        puppet["mood"] = {f"MOOD_{i}": _random_mood(rng) for i in range(rng.randint(0, 3))}
+        puppet["mood"] = {f"MOOD_{i}": _random_mood(rng, gains) for i in range(rng.randint(0, 3))}
     return {key: value for key, value in puppet.items() if value != {}}
 
 
-def random_score(rng, puppet, seconds, level="core"):
-    """Return a random score for `puppet`, as `tomllib` would give it, with cues in 0..seconds."""
+def random_score(rng, puppet, seconds, level="core", gains=True):
+    """Return a random score for `puppet`, as `tomllib` would give it, with cues in 0..seconds.
+
+    Cues of the `"full"` level have band gains if `gains` says so.
+    """
     frame_rate = puppet.get("frame_rate", 30)
     cues = []
     at_s = 0.0
     for _ in range(1 + round(seconds * rng.choice((0.3, 1, 3)))):
         if rng.random() < 0.7:
             at_s = _random_time(rng, seconds, frame_rate)
-        cues.append({"at": at_s} | _random_cue(rng, puppet, level))
+        cues.append({"at": at_s} | _random_cue(rng, puppet, level, gains))
     if rng.random() < 0.8:
         cues.sort(key=lambda cue: cue["at"])
     return {"cue": cues}
@@ -186,9 +190,9 @@ def _random_action(rng, level, puppet, longest):
     return action
 
 
-def _random_mood(rng):
+def _random_mood(rng, gains):
     mood = {}
-    if rng.random() < 0.7:
+    if gains and rng.random() < 0.7:
         mood["gains"] = _random_gains(rng)
     if rng.random() < 0.7:
         mood["tempo"] = _logarithmic(rng, 0.25, 4)
@@ -206,7 +210,7 @@ def _random_time(rng, seconds, frame_rate):
     return rng.choice((int(drawn), round(drawn, 1), round(drawn, 2), round(drawn, 6), round(drawn + 1e-6, 6)))
 
 
-def _random_cue(rng, puppet, level):
+def _random_cue(rng, puppet, level, gains):
     actions = list(puppet["action"])
     texts = [text for action in puppet["action"].values() for *_, text in action["map"]]
     texts += [function.get("expr", "") for function in puppet.get("function", {}).values()]
@@ -230,7 +234,7 @@ def _random_cue(rng, puppet, level):
             tempo[rng.choice(actions)] = _logarithmic(rng, 0.05, 8)
         if "mood" in puppet and rng.random() < 0.15:
             cue["mood"] = rng.choice(list(puppet["mood"]))
-        if rng.random() < 0.1:
+        if gains and rng.random() < 0.1:
             cue["gains"] = _random_gains(rng)
     if tempo:
         cue["tempo"] = tempo

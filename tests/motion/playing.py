@@ -22,11 +22,14 @@ class Case(NamedTuple):
     robot: dict | None = None
 
 
-def random_case(seed, seconds, **options):
-    """Return the random case of the `"core"` level that a seed stands for; `options` are those of `random_puppet`."""
-    rng = random.Random(seed)
-    puppet = random_puppet(rng, **options)
-    return Case(f"seed {seed}", puppet, random_score(rng, puppet, seconds))
+def random_case(seed, seconds, draw=0, **options):
+    """Return the random case that a seed stands for: all that the motion has, but band gains other than 1.
+
+    `draw` numbers the cases of one seed, `options` are those of `random_puppet`.
+    """
+    rng = random.Random(f"{seed}.{draw}")
+    puppet = random_puppet(rng, level="full", gains=False, **options)
+    return Case(f"seed {seed}.{draw}", puppet, random_score(rng, puppet, seconds, level="full", gains=False))
 
 
 def load(case):

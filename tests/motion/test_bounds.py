@@ -1,7 +1,8 @@
 """The base tap against the float64 reference: the bounds of `docs/motion.md`, over random puppets and all corners.
 
 `make test` plays some dozens of puppets, `make soak` some hundreds. A random draw in which the reference itself stands at
-the edge of a decision (a weight within 2^-24 of the 1/256 that it is compared with) says nothing and is passed over.
+the edge of a decision (a weight within 2^-24 of the 1/256 that it is compared with, a gesture within 1/8192 period of its
+end) says nothing: it is replaced by the next draw of its seed, and counted.
 """
 
 import math
@@ -16,8 +17,10 @@ import marotte
 from marotte.link import VirtualCarrier
 from marotte.mcu.unix import UnixMcu
 from marotte.prompter import Prompter
+from marotte.rendering import frame_count
 from tests.corners import SECONDS as CORNER_SECONDS
 from tests.corners import corners
+from tests.corners_full import full_corners
 from tests.motion.bounds import fractions_of_bound
 from tests.motion.playing import Case, load, play, random_case, tap
 from tests.reference import ReferencePuppet
@@ -25,7 +28,11 @@ from tests.reference import ReferencePuppet
 PUPPETS = Path(__file__).parents[2] / "puppets"
 QUICK_SEEDS, QUICK_SECONDS = range(30), 10
 SOAK_SEEDS, SOAK_SECONDS = range(1000, 1400), 40
+PET_SECONDS = 21
 SETTLING_TAUS = 18
+CORNERS = [*corners(), *full_corners()]
+DRAWS = 8
+"""Cases that are drawn for one seed before it counts as hopeless."""
 
 
 def reference_base(case, frames):
@@ -39,17 +46,24 @@ def reference_base(case, frames):
     return (base, weight_sums) if reference.is_decided() else None
 
 
-def assert_case_is_right(case, seconds):
-    """Play a case, hold all its taps against the definitions, and return its fractions of the bounds, or None."""
+def decided_case(seed, seconds):
+    """Return the seed's first random case in which every decision is clear, what the reference expects, and its number."""
+    for draw in range(DRAWS):
+        case = random_case(seed, seconds, draw)
+        expected = reference_base(case, frame_count(seconds, case.puppet.get("frame_rate", 30)))
+        if expected:
+            return case, expected, draw
+    raise AssertionError(f"seed {seed}: {DRAWS} draws in a row were too close to call")
+
+
+def assert_case_is_right(case, seconds, expected):
+    """Play a case, hold all its taps against the definitions, and return its fractions of the bounds."""
     rendering = play(case, seconds)
     base = tap(rendering, "base")
     assert numpy.array_equal(base, tap(rendering, "signal")), f"{case.name}: with all gains 1 the signal is the base"
     limits = numpy.array([dof.limits for dof in rendering.puppet.dofs.values()])
     rounding = 1 / 32768  # limits are rounded to the format of values
     assert numpy.allclose(tap(rendering, "motor"), numpy.clip(base, *limits.T), rtol=0, atol=rounding), case.name
-    expected = reference_base(case, len(base))
-    if expected is None:
-        return None
     strong, weak = fractions_of_bound(base, *expected)
     assert strong <= 1 and weak <= 1, (
         f"{case.name}: the base is off by {strong:.3f} of the bound 1/2048 and, "
@@ -60,30 +74,39 @@ def assert_case_is_right(case, seconds):
 
 @pytest.mark.parametrize("seed", QUICK_SEEDS)
 def test_base_of_random_puppets_keeps_the_bounds(seed):
-    assert_case_is_right(random_case(seed, QUICK_SECONDS), QUICK_SECONDS)
+    case, expected, _ = decided_case(seed, QUICK_SECONDS)
+    assert_case_is_right(case, QUICK_SECONDS, expected)
 
 
-@pytest.mark.parametrize("corner", corners(), ids=lambda corner: corner.name)
+@pytest.mark.parametrize("corner", CORNERS, ids=lambda corner: corner.name)
 def test_base_of_corners_keeps_the_bounds(corner):
-    assert_case_is_right(Case(*corner), CORNER_SECONDS)
+    case = Case(*corner)
+    expected = reference_base(case, frame_count(CORNER_SECONDS, case.puppet.get("frame_rate", 30)))
+    assert expected, "a decision of this corner is too close to call"
+    assert_case_is_right(case, CORNER_SECONDS, expected)
 
 
 def test_base_of_the_pet_keeps_the_bounds():
     puppet, score = (tomllib.loads((PUPPETS / name).read_text()) for name in ("pet.toml", "pet-score.toml"))
-    assert assert_case_is_right(Case("pet", puppet, score), 21) is not None
+    case = Case("pet", puppet, score)
+    assert_case_is_right(case, PET_SECONDS, reference_base(case, PET_SECONDS * puppet["frame_rate"]))
 
 
 @pytest.mark.soak
 def test_base_of_hundreds_of_random_puppets_keeps_the_bounds(capsys):
-    found = [assert_case_is_right(random_case(seed, SOAK_SECONDS), SOAK_SECONDS) for seed in SOAK_SEEDS]
-    decided = [fractions for fractions in found if fractions]
-    strong, weak = numpy.max(decided, axis=0)
+    found = []
+    replaced = 0
+    for seed in SOAK_SEEDS:
+        case, expected, draw = decided_case(seed, SOAK_SECONDS)
+        found.append(assert_case_is_right(case, SOAK_SECONDS, expected))
+        replaced += draw
+    strong, weak = numpy.max(found, axis=0)
     with capsys.disabled():
         print(
-            f"\nbase tap: {len(decided)} random puppets x {SOAK_SECONDS} s, worst error {strong:.3f} of 1/2048, "
-            f"{weak:.3f} of 1/128 where weights are faint; {len(found) - len(decided)} too close to call"
+            f"\nbase tap: {len(found)} random puppets x {SOAK_SECONDS} s, worst error {strong:.3f} of 1/2048, "
+            f"{weak:.3f} of 1/128 where weights are faint; {replaced} draws too close to call were replaced"
         )
-    assert len(decided) > 0.9 * len(found)
+    assert replaced < len(found)
 
 
 @pytest.mark.parametrize("tau_s", [0.03, 0.1, 0.25, 2, 10, [0.03, 3], [3, 0.03]])

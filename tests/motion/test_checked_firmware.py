@@ -4,10 +4,12 @@ import numpy
 import pytest
 
 from tests.corners import corners
+from tests.corners_full import full_corners
 from tests.motion.checked_mcu import CheckedMcu
 from tests.motion.playing import TAPS, Case, play, random_case, tap
 
-CORNERS = [Case(*corner) for corner in corners() if corner.name in ("everything at once", "cues of one frame")]
+NAMED = ("everything at once", "cues of one frame", "one of each function", "a tempo with every frame")
+CORNERS = [Case(*corner) for corner in (*corners(), *full_corners()) if corner.name in NAMED]
 CASES = [(case, 4) for case in CORNERS] + [(random_case(seed, 4), 4) for seed in range(300, 303)]
 
 

@@ -20,6 +20,7 @@ from marotte.pulses import pulses
 from marotte.rendering import Rendering
 from shared import codec
 from tests.corners import corners
+from tests.corners_full import full_corners
 from tests.motion.playing import TAPS, Case, play, random_case, tap
 
 SEEDS = range(200, 220)
@@ -86,7 +87,14 @@ def identity_cases():
                 middle = 0 if least else dof.get("rest", 0.5)
                 dof["limits"] = [round(rng.uniform(least, middle), 3), round(rng.uniform(middle, 1), 3)]
         cases.append(case._replace(robot=random_robot(rng, case.puppet)))
-    return cases + [Case(*corner) for corner in corners() if corner.name in ("everything at once", "fastest phases")]
+    named = (
+        "everything at once",
+        "fastest phases",
+        "one of each function",
+        "phases behind the master's",
+        "blink after re-entry",
+    )
+    return cases + [Case(*corner) for corner in (*corners(), *full_corners()) if corner.name in named]
 
 
 CASES = identity_cases()
