@@ -137,7 +137,7 @@ def test_gesture_called_again_while_it_fades_goes_on_for_its_cycles():
     played = Played(entry=formats.ENTRY_START, cycles=2)
     targets = []
     wanted = formats.WEIGHT_ONE
-    for sixteenth in range(0, 80):  # sixteen frames a period
+    for sixteenth in range(80):  # sixteen frames a period
         played.actions.w_q28[0] = formats.WEIGHT_ONE // 2  # never faint: it enters with the first target only
         wanted = formats.WEIGHT_ONE if sixteenth in (0, 40) else played.actions.target_q28[0]
         played.frame([sixteenth >> 4, (sixteenth & 15) << 12, 0], wanted)

@@ -87,31 +87,43 @@ def test_targets_are_stored_whole_or_refused_by_their_first_bad_field(payload):
         assert stored == [Target(frame, kind, *item) for item in items]
 
 
-queued = st.builds(
-    Target,
-    integers(0, LATEST_FRAME, 99, 100, 101),
-    st.sampled_from([MODULE.WEIGHT, MODULE.LIVE, MODULE.WEIGHT | NOW, MODULE.LIVE | NOW]),
-    st.integers(0, 3),
-    integers(0, formats.WEIGHT_MAX),
-) | st.builds(
-    Target,
-    integers(0, LATEST_FRAME, 99, 100, 101),
-    st.sampled_from([MODULE.TEMPO, MODULE.TEMPO | NOW]),
-    st.just(formats.MASTER),
-    integers(formats.MASTER_TEMPO_MIN_Q16, formats.MASTER_TEMPO_MAX_Q16),
-) | st.builds(
-    Target,
-    integers(0, LATEST_FRAME, 99, 100, 101),
-    st.sampled_from([MODULE.TEMPO, MODULE.TEMPO | NOW]),
-    st.integers(0, 3),
-    integers(formats.TEMPO_MIN_Q16, formats.TEMPO_MAX_Q16),
+queued = (
+    st.builds(
+        Target,
+        integers(0, LATEST_FRAME, 99, 100, 101),
+        st.sampled_from([MODULE.WEIGHT, MODULE.LIVE, MODULE.WEIGHT | NOW, MODULE.LIVE | NOW]),
+        st.integers(0, 3),
+        integers(0, formats.WEIGHT_MAX),
+    )
+    | st.builds(
+        Target,
+        integers(0, LATEST_FRAME, 99, 100, 101),
+        st.sampled_from([MODULE.TEMPO, MODULE.TEMPO | NOW]),
+        st.just(formats.MASTER),
+        integers(formats.MASTER_TEMPO_MIN_Q16, formats.MASTER_TEMPO_MAX_Q16),
+    )
+    | st.builds(
+        Target,
+        integers(0, LATEST_FRAME, 99, 100, 101),
+        st.sampled_from([MODULE.TEMPO, MODULE.TEMPO | NOW]),
+        st.integers(0, 3),
+        integers(formats.TEMPO_MIN_Q16, formats.TEMPO_MAX_Q16),
+    )
 )
 
 
-@given(st.lists(queued, max_size=ROOM), integers(0, LATEST_FRAME, 100), st.tuples(st.integers(0, 10), st.integers(0, 1)))
+@given(
+    st.lists(queued, max_size=ROOM), integers(0, LATEST_FRAME, 100), st.tuples(st.integers(0, 10), st.integers(0, 1))
+)
 def test_targets_act_in_their_frame_in_order_and_the_rest_waits(targets, frame, before):
     queue = Queue(targets)
-    weights, lives, master, tempos, counts = words([-1] * 4), words([-2] * 4), words([-3]), words([-4] * 4), words(before)
+    weights, lives, master, tempos, counts = (
+        words([-1] * 4),
+        words([-2] * 4),
+        words([-3]),
+        words([-4] * 4),
+        words(before),
+    )
     count = MODULE._apply(frame, len(targets), *queue.arrays, weights, lives, master, tempos, counts)
 
     due = [target for target in targets if target.frame <= frame]
