@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shared import formats, messages
+from shared import formats, messages, program
 
 CHECKOUT = Path(__file__).parents[2]
 SOURCES = {folder: sorted((CHECKOUT / folder).rglob("*.py")) for folder in ("firmware", "shared", "host")}
@@ -52,6 +52,27 @@ CONSTANTS = [
     ("functions", "_RCOS", formats.FUNCTION_RCOS),
     ("functions", "_NOISE", formats.FUNCTION_NOISE),
     ("functions", "_CONST", formats.FUNCTION_CONST),
+    ("functions", "_CURVE", formats.FUNCTION_CURVE),
+    ("programs", "_PROGRAM", formats.FUNCTION_PROGRAM),
+    ("programs", "_LIMIT", program.LIMIT_Q16),
+    ("programs", "_CONST", program.CONST),
+    ("programs", "_RSIN", program.RSIN),
+    ("programs", "_RCOS", program.RCOS),
+    ("programs", "_NOISE", program.NOISE),
+    ("programs", "_CURVE", program.CURVE),
+    ("programs", "_LIVE", program.LIVE),
+    ("programs", "_ADD", program.ADD),
+    ("programs", "_SUB", program.SUB),
+    ("programs", "_MUL", program.MUL),
+    ("programs", "_SCALE", program.SCALE),
+    ("programs", "_NEG", program.NEG),
+    ("programs", "_ABS", program.ABS),
+    ("programs", "_MIN", program.MIN),
+    ("programs", "_MAX", program.MAX),
+    ("programs", "_CLAMP", program.CLAMP),
+    ("blinks", "_RTRIGSIN", formats.FUNCTION_RTRIGSIN),
+    ("actions", "_ENTRY_START", formats.ENTRY_START),
+    ("exchange", "_NEW", formats.NEW),
     ("motor", "_ONE_Q15", formats.VALUE_ONE),
 ]
 
@@ -70,11 +91,16 @@ LITERALS = [
     ("weights", "integrate", formats.SNAP_Q28),
     ("compositor", "hold_targets", formats.FAINT_Q28),
     ("compositor", "hold_targets", formats.WEIGHT_ONE),
-    ("actions", "phases", formats.CYCLES - 1),
-    ("actions", "phases", (1 << formats.PHASE_BITS) - 1),
+    ("actions", "_phases", formats.CYCLES - 1),
+    ("actions", "_phases", (1 << formats.PHASE_BITS) - 1),
     ("functions", "evaluate", formats.VALUE_ONE),
     ("functions", "evaluate", (1 << formats.PHASE_BITS) - 1),
     ("functions", "evaluate", 1 << (formats.PHASE_BITS - 2)),
+    ("actions", "_rebase", formats.CYCLES - 1),
+    ("actions", "_risen", formats.FAINT_Q28),
+    ("blinks", "_evaluate", formats.FUNCTION_BLINK),
+    ("blinks", "_evaluate", formats.VALUE_ONE),
+    ("programs", "_evaluate", formats.VALUE_ONE),
     ("motor", "_move", formats.VALUE_ONE // 2),
 ]
 
