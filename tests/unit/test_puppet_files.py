@@ -109,7 +109,8 @@ def test_puppet_pet_is_complete():
     expected = "EYEBROW EYELID UPPERLIP LOWERLIP HEAD_YAW HEAD_PITCH NECK WHEEL_LEFT WHEEL_RIGHT BACK"
     assert list(puppet.dofs) == expected.split()
     assert [dof.name for dof in puppet.dofs.values() if dof.is_relative] == ["WHEEL_LEFT", "WHEEL_RIGHT"]
-    assert {"NEUTRAL_HEAD", "NEUTRAL_BODY", "HAPPY_FACE", "PIGEON_WALK"} < set(puppet.actions)
+    assert {"NEUTRAL_HEAD", "NEUTRAL_BODY", "HAPPY_FACE", "PIGEON_WALK", "RANDOMBLINK"} < set(puppet.actions)
+    assert [name for name, action in puppet.actions.items() if action.cycles] == ["NOD", "SHAKE", "TREMBLE", "SIGH"]
     moved = {entry.dof for action in puppet.actions.values() for entry in action.mappings}
     assert moved == set(puppet.dofs)
 
