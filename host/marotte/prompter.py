@@ -58,10 +58,6 @@ class Prompter:
             sent.append(step)
         return sent
 
-    def exchange(self, steps: Sequence[Step]) -> None:
-        """Go on with other steps. What has been sent still waits, and takes its room until its frames are over."""
-        self._steps = deque(steps)
-
     def _send(self, step: Step) -> None:
         frame = step.frame
         if step.weights:

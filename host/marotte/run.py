@@ -12,10 +12,9 @@ from fractions import Fraction
 from marotte.errors import MarotteError
 from marotte.files import Files, Watch
 from marotte.link import Carrier, LinkRefused
-from marotte.prompter import AHEAD_FRAMES, Prompter
+from marotte.prompter import Prompter
 from marotte.puppet import Puppet
-from marotte.score import Score, resumed
-from marotte.score import state as score_state
+from marotte.score import Score, resumed, state
 from marotte.session import Session
 from marotte.tables import build_tables, value_of
 from marotte.tomlfile import FileMistakes
@@ -106,8 +105,7 @@ class _Play:
 
     def begin(self) -> None:
         """Send the first steps and start the motion, so that the cues of frame 0 act in frame 0."""
-        puppet = self.files.puppet
-        self.session.telemetry(formats.TAP_MOTOR, _every(puppet, REFRESH_HZ), _every(puppet, WEIGHTS_HZ))
+        self._ask_for_telemetry(self.files.puppet)
         self._prompter.reached(-1)
         if self._arm:
             self.session.arm()
@@ -138,7 +136,12 @@ class _Play:
         tables = build_tables(files.puppet, files.robot)
         begin_us = self.session.carrier.now_us()
         if files.puppet.frame_rate_hz != before.frame_rate_hz:
-            self.session.upload(tables)
+            try:
+                self.session.upload(tables)
+            except LinkRefused:
+                self.session.upload(build_tables(before, self.files.robot))
+                self._restart(self.files)
+                raise
             self._restart(files)
             how = f"with a new frame rate: its motion begins anew at {files.puppet.frame_rate_hz} frames a second"
         else:
@@ -159,17 +162,23 @@ class _Play:
 
     def _go_on_with(self, files: Files) -> None:
         """Bring what has been exchanged to where the new score stands."""
+        self.session.open()  # once more: that empties the queue of what the old score had in it
+        self._ask_for_telemetry(files.puppet)
         self._take_telemetry()
         before = self.files.puppet
-        was = score_state(self._steps, before, self.scene.frame)
+        was = state(self._steps, before, self.scene.frame)
         self._take(files)
-        now, *later = resumed(self._steps, files.puppet, self.scene.frame, self.scene.frame + AHEAD_FRAMES + 1)
+        now, *later = resumed(self._steps, files.puppet, self.scene.frame)
         actions = list(before.actions)
         cued = [actions[index] for index in was.tempos if actions[index] in files.puppet.actions]
         tempos = {files.puppet.action_index(name): files.puppet.actions[name].tempo for name in cued}
-        self._prompter.exchange([replace(now, tempos={**tempos, **now.tempos}), *later])
+        steps = [replace(now, tempos={**tempos, **now.tempos}), *later]
+        self._prompter = Prompter(self.session, steps, self.session.welcome["queue_max"])
         if self._arm:
             self.session.arm()  # for outputs that are new
+
+    def _ask_for_telemetry(self, puppet: Puppet) -> None:
+        self.session.telemetry(formats.TAP_MOTOR, _every(puppet, REFRESH_HZ), _every(puppet, WEIGHTS_HZ))
 
     def _take(self, files: Files) -> None:
         """Take what is to be played from now on, from the frame that has been reached."""

@@ -115,14 +115,10 @@ def state(steps: Sequence[Step], puppet: Puppet, frame: int) -> Step:
     return Step(frame, weights, lives, master_tempo, tempos)
 
 
-def resumed(steps: Sequence[Step], puppet: Puppet, frame: int, settled: int) -> list[Step]:
-    """Return what brings an MCU that has played something else to where the steps are in `frame`, and goes on from there.
-
-    Targets of what it has played before may still act until the frame before `settled`; in that one everything is set once more.
-    """
+def resumed(steps: Sequence[Step], puppet: Puppet, frame: int) -> list[Step]:
+    """Return what brings an MCU that has played something else to where the steps are in `frame`, and what is to follow."""
     now = replace(state(steps, puppet, frame), frame=FRAME_NOW)
-    soon = [step for step in steps if frame < step.frame <= settled]
-    return [now, *soon, state(steps, puppet, settled), *(step for step in steps if step.frame > settled)]
+    return [now, *(step for step in steps if step.frame > frame)]
 
 
 def load_score(path: str | Path, puppet: Puppet) -> Score:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marotte.puppet_file import load_puppet
-from marotte.score import Cue, Score, load_score, read_score
+from marotte.score import Cue, Score, Step, load_score, read_score, resumed, state
 from marotte.supported import NOT_YET
 from marotte.tomlfile import FileMistakes
 
@@ -236,3 +236,22 @@ def test_score_steps_lead_to_the_targets_of_the_definition(tmp_path_factory, cue
                     expected = {name: puppet.behaviours[cue.behaviour].get(name, 0.0) for name in names}
                 expected.update(cue.weights)
         assert sent == expected
+
+
+def test_state_is_what_all_cues_until_then_have_set(puppet):
+    steps = [
+        Step(0, {0: 1.0}, {0: 0.25}, None),
+        Step(10, {0: 0.0, 1: 2.0}, {}, 1.5, {2: 3.0}),
+        Step(11, {2: 4.0}, {0: 1.0}, None),
+    ]
+    assert state(steps, puppet, -1) == Step(-1, {0: 0.0, 1: 0.0, 2: 0.0}, {0: puppet.lives["GAZE"].rest}, 1.0)
+    assert state(steps, puppet, 10) == Step(10, {0: 0.0, 1: 2.0, 2: 0.0}, {0: 0.25}, 1.5, {2: 3.0})
+    now, *later = resumed(steps, puppet, 10)
+    assert (now.frame, now.weights, later) == (-1, {0: 0.0, 1: 2.0, 2: 0.0}, steps[2:])
+
+
+def test_state_leaves_gestures_alone(tmp_path):
+    (tmp_path / "p.toml").write_text(
+        '[dof.D]\n[action.G]\nentry="start"\ncycles=2\nmap=[["D",0,1,"rsin"]]\n[action.A]\nmap=[["D",0,1,"rsin"]]\n'
+    )
+    assert state([Step(0, {0: 1.0}, {}, None)], load_puppet(tmp_path / "p.toml"), 5).weights == {1: 0.0}
