@@ -20,6 +20,8 @@ from marotte.wiring import Robot
 
 BAR_WIDTH = 30
 WEIGHT_WIDTH = 16
+FEW_ACTIONS = 18
+"""More than these share three columns instead of two, so that the picture stays within a small terminal."""
 WEIGHT_FULL = 1.0
 """The weight that fills its bar; a heavier one shows its number only."""
 REFRESH_HZ = 12
@@ -129,20 +131,21 @@ class View:
         return f"GP{output.pin} {low_us + (high_us - low_us) * share:6.1f} us"
 
     def _weights(self, scene: Scene) -> RenderableType:
-        grid = Table.grid(padding=(0, 2))
-        for _ in range(2):
+        columns, bar_width, gap = (2, WEIGHT_WIDTH, 2) if len(self.puppet.actions) <= FEW_ACTIONS else (3, 4, 1)
+        grid = Table.grid(padding=(0, gap))
+        for _ in range(columns):
             grid.add_column(min_width=14)
-            grid.add_column()
-            grid.add_column(justify="right")
-        cells = []
+            grid.add_column(min_width=bar_width)
+            grid.add_column(min_width=4, justify="right")
+        cells: list[tuple[RenderableType, ...]] = []
         for name in self.puppet.actions:
             weight = scene.weights.get(name, 0.0)
-            bar = Text(bar_text(min(weight / WEIGHT_FULL, 1), WEIGHT_WIDTH), style="cyan")
+            bar = Text(bar_text(min(weight / WEIGHT_FULL, 1), bar_width), style="cyan")
             cells.append((Text(name, style="" if weight else "dim"), bar, f"{weight:.2f}" if weight else ""))
-        half = (len(cells) + 1) // 2
-        for row in range(half):
-            right = cells[row + half] if row + half < len(cells) else ("", "", "")
-            grid.add_row(*cells[row], *right)
+        rows = -(-len(cells) // columns)
+        cells += [("", "", "")] * (rows * columns - len(cells))
+        for row in range(rows):
+            grid.add_row(*(cell for triple in cells[row::rows] for cell in triple))
         return grid
 
     def _footer(self, scene: Scene) -> RenderableType:
