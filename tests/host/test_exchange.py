@@ -1,6 +1,9 @@
 """Another puppet while one plays: what keeps its name goes on without a jump, and mistakes change nothing."""
 
 import os
+import signal
+import subprocess
+import sys
 from fractions import Fraction
 
 import pytest
@@ -253,3 +256,19 @@ def test_watch_tells_a_mistake_once(paths):
     with pytest.raises(FileMistakes, match="found -1"):
         watch.changed(LOOK_US)
     assert watch.changed(2 * LOOK_US) is None
+
+
+def test_run_command_watches_its_files(paths):
+    command = [sys.executable, "-u", "-m", "marotte", "run", str(paths[0]), "--score", str(paths[1]), "--mcu", "unix"]
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([*command, "--watch", "--no-view"], **options) as process:
+        assert process.stdout.readline().startswith("p uploaded in ")
+        rewrite(paths[0], PUPPET.replace("tempo = 0.7", "tempo = 9"))
+        lines = iter(process.stdout.readline, "")
+        assert any("found 9, expected a number in 0.05..8" in line for line in lines)
+        rewrite(paths[0], TURNED)
+        assert any(line.startswith("p exchanged in ") for line in lines)
+        os.kill(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=10)
+    assert (process.returncode, err) == (130, "")
+    assert ", 0 late" in out
