@@ -311,7 +311,7 @@ class Link:
         if self._detail:
             return messages.INCOMPLETE
         bad = self._judge(puppet.staged.doubled())
-        if bad == messages.OK and playing and not check_kept(puppet.staged, puppet.tables):
+        if bad == messages.OK and not check_kept(puppet.staged, puppet.tables):
             bad = self._judge(0)
         if bad == messages.OK:
             puppet.commit()

@@ -22,10 +22,16 @@ Direct a robot by hand:
     while True:
         session.pump(20_000)
 
+Give it other tables while it moves; what keeps its name goes on:
+
+    other = marotte.load_puppet("puppets/pet.toml")
+    session.exchange(marotte.build_tables(other, robot), playing=puppet)
+
 Values are 0..1 for absolute DOFs and -1..1 for relative ones, weights 0..4, live channels 0..1, tempos factors. Whatever the user
 can do something about raises a subclass of `MarotteError`, whose text is complete.
 """
 
+from marotte.curves import ImportedCurve, import_curve
 from marotte.errors import MarotteError
 from marotte.link import LinkError, VirtualCarrier
 from marotte.ports import PortError, SerialCarrier, available
@@ -43,6 +49,7 @@ __all__ = [
     "FRAME_NOW",
     "Cue",
     "FileMistakes",
+    "ImportedCurve",
     "LinkError",
     "MarotteError",
     "Mistake",
@@ -58,6 +65,7 @@ __all__ = [
     "VirtualCarrier",
     "available",
     "build_tables",
+    "import_curve",
     "load_puppet",
     "load_robot",
     "load_score",

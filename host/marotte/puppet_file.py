@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from marotte import functions
+from marotte.function_tables import FunctionReader
 from marotte.functions import Function, FunctionError
 from marotte.pools import Pools
 from marotte.positions import KeyPath
@@ -36,7 +36,6 @@ GAIN_RANGE = (-4, 4)
 TAU_RANGE_S = (0.03, 10)
 WARP_RANGE_S = (0.05, 10)
 CYCLES_RANGE = (1, formats.CYCLES_MAX)
-SAMPLES_RANGE = (2, formats.SAMPLES_MAX)
 SEED_MAX = 2**32 - 1
 MASTER_NAME = "global"
 """What a score's tempo table calls the master tempo; no action can have this name."""
@@ -85,8 +84,7 @@ class _Reader:
     def __init__(self, document: Document) -> None:
         self.document = document
         self.root = document.root()
-        self.functions: dict[str, Function] = {}
-        self.parsed: dict[str | None, Function | FunctionError] = {}
+        self.functions = FunctionReader(document)
         self.blinking: set[object] = set()
         self.dofs: dict[str, Dof] = {}
         self.lives: dict[str, Live] = {}
@@ -101,13 +99,13 @@ class _Reader:
         when_silent = root.choice("when_silent", ("idle", "rest", "relax"), "idle")
         if when_silent != "idle":
             root.not_yet("when_silent", "when_silent")
-        curves = self.curves()
+        curves = self.functions.curves(root)
         self.blinking = self.blinking_dofs()
         dofs = {name: self.dof(table, name) for name, table in root.tables("dof")}
         self.dofs = dofs
         self.lives = {name: self.live(table, name) for name, table in root.tables("live")}
-        for function in self.functions.values():
-            self.declare_channels(function)
+        for curve in curves.values():
+            self.declare_channels(curve.function)
         actions = {name: self.action(table, name) for name, table in root.tables("action")}
         behaviours = {name: weights(table, actions) for name, table in root.tables("behaviour")}
         moods = {name: self.mood(table, name) for name, table in root.tables("mood")}
@@ -155,7 +153,7 @@ class _Reader:
         tables = [table for table in actions.values() if isinstance(table, dict)] if isinstance(actions, dict) else []
         maps = [table["map"] for table in tables if isinstance(table.get("map"), list)]
         rows = [row for rows in maps for row in rows if isinstance(row, list) and len(row) == 4]
-        parsed = [(dof, self.parse(text)) for dof, _, _, text in rows if isinstance(dof, str)]
+        parsed = [(dof, self.functions.parse(text)) for dof, _, _, text in rows if isinstance(dof, str)]
         return {dof for dof, function in parsed if isinstance(function, Function) and function.blinks}
 
     def character(self, table: Table) -> Character:
@@ -167,43 +165,6 @@ class _Reader:
         )
         inner.finish()
         return character
-
-    def curves(self) -> dict[str, Curve]:
-        """Return the `[function.NAME]`s in the file's order; tables are read first, as expressions may name them."""
-        tables = dict(self.root.tables("function"))
-        curves = {}
-        for name in sorted(tables, key=lambda name: tables[name].has("expr")):
-            curves[name] = self.curve(name, tables[name])
-            self.functions[name] = curves[name].function
-        return {name: curves[name] for name in tables}
-
-    def curve(self, name: str, table: Table) -> Curve:
-        if name in functions.PRIMITIVES or name == "t":
-            table.mistake(f'"{name}" is the name of a primitive; expected another name')
-        elif not is_identifier(name):
-            table.mistake("expected a name of letters, digits and _, as it stands in expressions")
-        expression = table.text("expr", "") if table.has("expr") else None
-        samples = self.samples(table) if table.has("table") else ()
-        function = Function("curve", (name,)) if table.has("table") else Function("const", (0.0,))
-        if isinstance(table.value("expr"), str):
-            try:
-                function = functions.parse_expression(table.value("expr"), self.functions)
-            except FunctionError as error:
-                table.mistake(f"found {found(table.value('expr'))}: {error}", "expr")
-        if table.has("expr") == table.has("table"):
-            what = "both" if table.has("expr") else "neither"
-            table.mistake(f'has {what}, expected one of "expr" and "table"')
-        table.finish()
-        return Curve(name, function, expression, samples)
-
-    def samples(self, table: Table) -> tuple[float, ...]:
-        values = table.array("table", "an array of samples in 0..1") or []
-        if values and not SAMPLES_RANGE[0] <= len(values) <= SAMPLES_RANGE[1]:
-            low, high = SAMPLES_RANGE
-            table.mistake(f"found {len(values)} samples, expected {low}..{high}", "table")
-        path = (*table.path, "table")
-        good = [check_number(self.document, (*path, index), value, 0, 1) for index, value in enumerate(values)]
-        return tuple(float(value) for value in values) if all(good) else ()
 
     def live(self, table: Table, name: str) -> Live:
         if not is_identifier(name):
@@ -262,22 +223,12 @@ class _Reader:
         return MappingEntry(dof, float(low), float(high), function) if known and all(good) and function else None
 
     def function(self, path: KeyPath, text: Any) -> Function | None:
-        function = self.parse(text)
+        function = self.functions.parse(text)
         if isinstance(function, FunctionError):
             self.document.mistake((*path, 3), f"found {found(text)}: {function}")
             return None
         self.declare_channels(function)
         return function
-
-    def parse(self, text: Any) -> Function | FunctionError:
-        """Return what a FUNCTION means, or what is wrong with it; each text is parsed once."""
-        key = text if isinstance(text, str) else None
-        if key not in self.parsed:
-            try:
-                self.parsed[key] = functions.parse_function(text, self.functions)
-            except FunctionError as error:
-                self.parsed[key] = error
-        return self.parsed[key]
 
     def declare_channels(self, function: Function) -> None:
         """Note the live channels that a function reads without their being declared."""

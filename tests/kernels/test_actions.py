@@ -165,6 +165,8 @@ def warp(offset_q28, warp_q26, tempo_q16=formats.TEMPO_ONE, master_q16=formats.T
 
 
 @given(offsets_q28, alphas_q26, tempos_q16, master_tempos_q16, rates_hz)
+@example(HALF_CYCLE_Q28, formats.ALPHA_ONE // 2, formats.TEMPO_ONE, formats.TEMPO_ONE, 30)
+@example(-HALF_CYCLE_Q28, formats.ALPHA_ONE // 2, formats.TEMPO_ONE, formats.TEMPO_ONE, 30)
 def test_offset_shrinks_by_its_share_and_no_more_than_half_the_advance(offset, share_q26, tempo, master_tempo, rate):
     half = Fraction(tempo * master_tempo * CYCLE_Q28, 2 * rate * 65536 * 65536)
     step = min(abs(offset) * Fraction(share_q26, formats.ALPHA_ONE), half)

@@ -1,4 +1,4 @@
-"""The exchange of tables: every state array is gathered by the list of old places, in checked integers."""
+"""The exchange of tables: every state array is gathered by the list of old places; equal functions are found."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,6 +8,7 @@ from tests.checked import load_checked
 from tests.kernels.values import halves, integers, tempos_q16, words
 
 MODULE = load_checked("firmware/exchange.py")
+TABLES = load_checked("firmware/tables.py")
 COUNT = 6
 
 any_word = integers(-(1 << 31), (1 << 31) - 1, 0)
@@ -52,3 +53,23 @@ def test_tempos_of_what_stays_change_where_the_file_has_changed(old, before, aft
         else:
             changed = before[old[i]] != after[i]
             assert (found[i], found_wanted[i]) == (tempos[i], after[i] if changed else wanted[i])
+
+
+def repeats(mappings):
+    """Return which mapping each has its value from; `mappings` are (function, argument) of one action."""
+    tables = TABLES.Tables()
+    tables.first_mapping[1], tables.mapping_count[1] = 3, len(mappings)
+    for m, (function, argument) in enumerate(mappings):
+        tables.function[3 + m], tables.argument[3 + m] = function, argument
+    tables.link_repeats(1)
+    return [same - 3 for same in tables.same[3 : 3 + len(mappings)]]
+
+
+functions = st.tuples(st.integers(0, formats.FUNCTION_RTRIGSIN), st.integers(0, 2))
+
+
+@given(st.lists(functions, max_size=formats.DOFS_MAX))
+def test_equal_functions_of_an_action_are_evaluated_once_but_every_blink_for_itself(mappings):
+    assert repeats(mappings) == [
+        mappings.index(mapping) if mapping[0] < formats.FUNCTION_BLINK else m for m, mapping in enumerate(mappings)
+    ]

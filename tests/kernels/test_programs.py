@@ -23,7 +23,7 @@ PRIMITIVE_ERROR = 2.0**-14
 STEP_ERROR = 2.0**-15
 """What one operation drops or rounds, at most two units of Q16."""
 
-GRADIENTS = halves(random.Random(1).randrange(65536) for _ in range(formats.NOISE_TABLES * formats.GRADIENTS))
+GRADIENTS = halves(random.Random(1).choices(range(65536), k=formats.NOISE_TABLES * formats.GRADIENTS))
 CURVES = {
     "SAW": [0, ONE],
     "ODD": [3277, 29491, 9830, 22938, ONE, 0, 6554],
@@ -232,6 +232,9 @@ class Meant:
 
 
 @given(valid_programs(), phases)
+@example([program.NOISE, 3, 16, 0, 0], (77, 1 << 22))
+@example([program.NOISE, 3, -40, 200, 1 << 22], (4095, UNIT - 1))
+@example([program.CURVE, 0, 16, 0], (5, UNIT * 3 // 4))
 def test_valid_programs_give_what_they_mean(pool, phase):
     value, error = Meant(phase).value(pool)
     assert abs(evaluate(checked(pool), phase) / ONE - value) <= error

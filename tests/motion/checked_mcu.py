@@ -9,7 +9,23 @@ TICKS_MODULUS = 1 << 30
 SMALL_INT_FUNCTIONS = (
     "ticks_diff",
     *(f"FrameClock.{name}" for name in ("start", "until_us", "begin")),
-    *(f"Cues.{name}" for name in ("clear", "put", "apply")),
+    *(f"Cues.{name}" for name in ("clear", "put", "apply", "renumber")),
+    *(
+        f"Actions.{name}"
+        for name in (
+            "compute_phases",
+            "follow_tempos",
+            "end_gestures",
+            "enter",
+            "warp",
+            "_phases",
+            "_nominal",
+            "_place",
+        )
+    ),
+    *(f"Blinks.{name}" for name in ("enter", "evaluate", "exchange")),
+    "Programs.evaluate",
+    *(f"Exchange.{name}" for name in ("carry_over", "_swap")),
     *(f"Motor.{name}" for name in ("load", "move", "stand", "arm", "kill", "_write")),
     *(f"Puppet.{name}" for name in ("start", "stop", "prepare", "step", "_synthesise", "_rest")),
     *(f"Actions.{name}" for name in ("compute_phases", "follow_tempos", "end_gestures", "enter", "warp", "_place")),
@@ -58,6 +74,8 @@ class CheckedMcu(VirtualMcu):
                 if until_us <= 0:
                     puppet.step(link.silent)
                     link.report()
+                    continue
+                if puppet.prepare():
                     continue
                 due_us = board.now_us + until_us
             board.now_us = min(due_us, t_us)
