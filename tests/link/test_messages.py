@@ -11,7 +11,7 @@ from marotte.session import DICTIONARY
 from shared import codec, messages
 
 RANGES = {"B": (0, 0xFF), "H": (0, 0xFFFF), "I": (0, 0xFFFFFFFF), "i": (-0x80000000, 0x7FFFFFFF)}
-SUFFIXES = ("_q12", "_q15", "_q16", "_q26", "_q28", "_hz", "_ms", "_us", "_q4us")
+SUFFIXES = ("_q12", "_q15", "_q16", "_q18", "_q26", "_q28", "_hz", "_ms", "_us", "_q4us")
 COUNTS = {
     *("protocol", "dictionary", "seed", "seq", "status", "detail", "frame", "armed", "silent"),
     *(
@@ -28,6 +28,8 @@ COUNTS = {
         "kind",
         "pin",
     ),
+    *("curve", "curves", "samples", "program", "programs", "words", "word", "blink", "blinks", "entry", "cycles"),
+    *("first", "old"),
     *("pulse0_q4us", "pulse1_q4us", "taps", "taps_every", "weights_every", "packets", "damaged"),
     *("dofs_max", "actions_max", "mappings_max", "lives_max", "queue_max", "late_frames", "late_targets", "heap_free"),
 }
