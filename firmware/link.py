@@ -158,7 +158,6 @@ class Link:
         if self._length and ticks_diff(now_us, self._byte_us) > _STALE_US:
             self._length = 0
             self.damaged += 1
-        self._byte_us = now_us
         start = 0
         while start < end:
             stop = _collect(chunk, start, end, wire, self._length, codec.WIRE_MAX)
@@ -169,6 +168,7 @@ class Link:
                 self._length = 0
                 if length:  # a second zero ends nothing
                     self._packet(length)
+        self._byte_us = board.ticks_us()  # after the packets, of which a `commit` may take long
         return False
 
     def _packet(self, length):

@@ -4,6 +4,10 @@ Data runs one way: targets, weights, actions, functions, compositor, motor, boar
 that are made here once; a frame allocates nothing.
 """
 
+import gc
+
+from micropython import const
+
 from firmware import clock, compositor, functions, weights
 from firmware.actions import Actions
 from firmware.blinks import Blinks
@@ -21,6 +25,8 @@ from shared.formats import (
     TEMPO_ONE,
     WEIGHT_ONE,
 )
+
+_COLLECT_US = const(12000)  # what the heap's collection takes on an RP2040
 
 
 class Puppet:
@@ -66,6 +72,7 @@ class Puppet:
         self.hold_state = (self._hold_target_q28, self._hold_x_q28, self._hold_w_q28)
         self.exchange = Exchange(self)
         self._exchange_due = False
+        self._prepared_in = -1
         self._tempos_changed = 0
 
     def commit(self):
@@ -97,10 +104,20 @@ class Puppet:
             self.commit()
 
     def prepare(self):
-        """Take a step of what an exchange of tables needs before the next frame; return whether there was one to take."""
+        """Take a step of what an exchange of tables needs before the next frame; return whether there was one to take.
+
+        The last one collects what tables leave on the heap, so that it does not fill up in the middle of a frame. It waits
+        until there is time for that, but no longer than for the end of the next frame.
+        """
         if self.exchange.step < 0 or self._exchange_due:
             return False
-        self._exchange_due = self.exchange.prepare()
+        if not self.exchange.prepare():
+            self._prepared_in = self.frame
+        elif self.frame == self._prepared_in and self.clock.until_us(self._board.ticks_us()) < _COLLECT_US:
+            return False
+        else:
+            gc.collect()
+            self._exchange_due = True
         return True
 
     def step(self, silent):

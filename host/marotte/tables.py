@@ -27,6 +27,9 @@ Message: TypeAlias = tuple[str, dict[str, int], list[dict[str, int]]]
 HOLD_TAU_S = 0.25
 """How HOLD, which takes over what no action moves, comes and goes."""
 
+UPLOAD_ITEMS_MAX = {"mappings": 8, "curve": 32, "program": 32}
+"""Most items of a message of an upload: what an RP2040 checks in 2 ms, so that no frame waits long for it."""
+
 _MESSAGES = {name: (fields, items) for name, _, fields, items in messages.MESSAGES}
 
 
@@ -52,7 +55,7 @@ class Tables:
         for index, action in enumerate(puppet.actions.values()):
             yield "action", self._action(index, action, first), []
             first += len(action.mappings)
-        step = items_per_message("mappings")
+        step = UPLOAD_ITEMS_MAX["mappings"]
         for start in range(0, len(mappings), step):
             yield "mappings", {"first_mapping": start}, mappings[start : start + step]
         for index, live in enumerate(puppet.lives.values()):
@@ -171,7 +174,7 @@ def items_per_message(name: str) -> int:
 
 def _in_parts(name: str, fields: dict[str, int], item: str, values: Sequence[int]) -> Iterator[Message]:
     """Yield as many messages of this name as the values need, in order; `item` is the field of an item."""
-    step = items_per_message(name)
+    step = UPLOAD_ITEMS_MAX[name]
     for start in range(0, len(values), step):
         yield name, fields, [{item: value} for value in values[start : start + step]]
 

@@ -7,7 +7,7 @@ import pytest
 from marotte.link import LinkRefused, VirtualCarrier, pack, wire_packet
 from marotte.mcu.unix import UnixMcu
 from marotte.session import DICTIONARY, LinkForeign, Session
-from shared import codec, formats, messages, program
+from shared import codec, formats, messages
 from tests.link.carriers import FaultyCarrier
 from tests.link.stage import ALL_TAPS, Parts, begin_performance, open_session, pet_tables
 
@@ -30,9 +30,9 @@ def wide_tables():
         "actions": 64,
         "mappings": 512,
         "lives": 16,
-        "curves": 2,
-        "programs": 2,
-        "blinks": 2,
+        "curves": 0,
+        "programs": 0,
+        "blinks": 0,
         "seed": 9,
         "noise_spread_q15": 0,
     }
@@ -41,8 +41,8 @@ def wide_tables():
         yield "dof", {"dof": dof, "kind": 0, "rest_q15": 16384, "low_q15": 0, "high_q15": 32768}, []
     for action in range(64):
         fields = {"action": action, "tempo_q16": 65536, "rise_q26": 1 << 22, "fall_q26": 1 << 22}
-        entry = {"entry": action % 2, "warp_q26": 1 << 22, "cycles": action % 2}
-        yield "action", {**fields, "first_mapping": 8 * action, "mappings": 8, **entry}, []
+        fields |= {"first_mapping": 8 * action, "mappings": 8, "entry": 0, "warp_q26": 1 << 22, "cycles": 0}
+        yield "action", fields, []
     for first in range(0, 512, 16):
         dofs = [8 * (place // 8 % 2) + place % 8 for place in range(first, first + 16)]
         items = [
@@ -52,13 +52,6 @@ def wide_tables():
         yield "mappings", {"first_mapping": first}, items
     for live in range(16):
         yield "live", {"live": live, "rest_q28": 1 << 27, "rise_q26": 1 << 22, "fall_q26": 1 << 22}, []
-    for index in range(2):
-        yield "curve", {"curve": index, "samples": 150}, [{"value_q15": 1}] * 120
-        yield "curve", {"curve": index, "samples": 150}, [{"value_q15": 32768}] * 30
-        words = [program.LIVE, 15, *[program.NEG] * 68]
-        yield "program", {"program": index, "words": 70}, [{"word": word} for word in words[:60]]
-        yield "program", {"program": index, "words": 70}, [{"word": word} for word in words[60:]]
-        yield "blink", {"blink": index, "threshold_q16": 65536, "gap_q18": 1000 << 18}, []
     yield "commit", {}, []
 
 
@@ -215,17 +208,19 @@ GOOD = {
         "mappings": 1,
         "entry": 1,
         "warp_q26": 1 << 20,
-        "cycles": 0,
+        "cycles": 1000,
     },
     "mapping": {"dof": 0, "function": 0, "argument": 0, "low_q15": 0, "high_q15": 0},
     "live": {"live": 0, "rest_q28": 0, "rise_q26": 1 << 20, "fall_q26": 1 << 20},
     "curve": {"curve": 0, "samples": 2},
     "program": {"program": 0, "words": 2},
-    "blink": {"blink": 0, "threshold_q16": 0, "gap_q18": 0},
+    "blink": {"blink": 0, "threshold_q16": 1 << 16, "gap_q18": 1000 << 18},
+    "keep": {"kind": 0, "first": 0},
 }
 ITEMS = {
     "curve": [{"value_q15": 0}, {"value_q15": 32768}],
-    "program": [{"word": program.CONST}, {"word": -(16 << 16)}],
+    "program": [{"word": 0}, {"word": -65536}],
+    "keep": [{"old": formats.NEW}],
 }
 BAD_FIELDS = [
     *(
@@ -233,6 +228,7 @@ BAD_FIELDS = [
         for name, value in [("frame_rate_hz", 9), ("frame_rate_hz", 61), ("dofs", 0), ("dofs", 17)]
     ),
     *(("begin", name, value) for name, value in [("actions", 65), ("mappings", 513), ("lives", 17)]),
+    *(("begin", name, value) for name, value in [("curves", 65), ("blinks", 129)]),
     *(("begin", name, value) for name, value in [("noise_spread_q15", 32769), ("hold_q26", 0), ("hold_q26", 1 << 26)]),
     *(("begin", name, value) for name, value in [("link_timeout_ms", 99), ("link_timeout_ms", 60001)]),
     *(("dof", name, value) for name, value in [("dof", 1), ("dof", 255), ("kind", 2), ("rest_q15", 32769)]),
@@ -249,16 +245,22 @@ BAD_FIELDS = [
     *(("action", name, value) for name, value in [("tempo_q16", 524289), ("tempo_q16", 0xFFFFFFFF), ("rise_q26", 0)]),
     *(("action", name, value) for name, value in [("rise_q26", 1 << 26), ("fall_q26", 0), ("fall_q26", 0x80000000)]),
     *(("action", name, value) for name, value in [("first_mapping", 1), ("first_mapping", 65535)]),
+    *(
+        ("action", name, value)
+        for name, value in [("mappings", 2), ("entry", 2), ("warp_q26", 0), ("warp_q26", 1 << 26)]
+    ),
+    *(("action", name, value) for name, value in [("cycles", 1001), ("entry", 0)]),
     *(("mapping", name, value) for name, value in [("dof", 2), ("dof", 255), ("function", 9), ("function", 255)]),
     *(("mapping", name, value) for name, value in [("low_q15", 32769), ("high_q15", 32769)]),
     *(("live", name, value) for name, value in [("live", 1), ("live", 255), ("rest_q28", (1 << 28) + 1)]),
     *(("live", name, value) for name, value in [("rest_q28", 0xFFFFFFFF), ("rise_q26", 0), ("fall_q26", 1 << 26)]),
-    *(("begin", name, value) for name, value in [("curves", 65), ("blinks", 129)]),
-    *(("action", name, value) for name, value in [("entry", 2), ("warp_q26", 0), ("warp_q26", 1 << 26)]),
-    ("action", "cycles", 1001),
     *(("curve", name, value) for name, value in [("curve", 1), ("samples", 1), ("samples", 257)]),
     *(("program", name, value) for name, value in [("program", 1), ("words", 0), ("words", 129)]),
-    *(("blink", name, value) for name, value in [("blink", 1), ("threshold_q16", 65537), ("gap_q18", 262144001)]),
+    *(
+        ("blink", name, value)
+        for name, value in [("blink", 1), ("threshold_q16", 65537), ("gap_q18", (1000 << 18) + 1)]
+    ),
+    *(("keep", name, value) for name, value in [("kind", 3), ("first", 1), ("first", 255)]),
 ]
 
 
@@ -271,7 +273,7 @@ def field_number(name, field):
 
 def order_of(name):
     """The messages that have to come before one of this name, and that message: `(name, fields, items)`."""
-    for step in ("begin", "dof", "output", "action", "mapping", "live", "curve", "program", "blink"):
+    for step in GOOD:
         if step == "mapping":
             yield "mappings", {"first_mapping": 0}, [GOOD["mapping"]]
         else:
@@ -308,6 +310,8 @@ def test_part_with_a_field_out_of_range_is_refused_and_changes_nothing(loaded, n
     else:
         fields = fields | {field: value}
     number = field_number(name, field)
+    if (name, field) in (("action", "mappings"), ("action", "entry")):
+        number = {number, field_number(name, "first_mapping"), field_number(name, "cycles")}
     if field == "low_q15":
         number = {number, number + 1} if name == "dof" else {number}
     status, detail = refused(session, last, fields, items)
@@ -318,11 +322,8 @@ def test_part_with_a_field_out_of_range_is_refused_and_changes_nothing(loaded, n
 
 @pytest.mark.parametrize(
     ("function", "argument", "taken"),
-    [
-        *[(2, 15, True), (2, 16, False), (3, 32768, True), (3, 32769, False), (4, 0, True), (4, 1, False)],
-        *[(5, 0, True), (5, 1, False), (6, 0, True), (6, 1, False), (7, 0, True), (7, 1, False), (8, 1, False)],
-        (0, 65535, True),
-    ],
+    [(2, 15, True), (2, 16, False), (3, 32768, True), (3, 32769, False), (4, 0, True), (4, 1, False), (0, 65535, True)]
+    + [(function, argument, argument == 0) for function in (5, 6, 7, 8) for argument in (0, 1, 65535)],
 )
 def test_mapping_with_an_argument_out_of_range_is_refused(loaded, function, argument, taken):
     session, first_taps = loaded
@@ -356,10 +357,30 @@ def test_tables_with_an_output_refused_leave_those_that_are_loaded(loaded):
     assert play(session) == first_taps
 
 
-def test_tables_of_another_frame_rate_are_refused_while_the_motion_runs(mcu):
+@pytest.mark.parametrize(
+    ("name", "items", "detail"),
+    [
+        ("curve", [{"value_q15": 0}, {"value_q15": 32769}], 3),
+        ("curve", [{"value_q15": 0}] * 3, 4),
+        ("program", [{"word": 0}, {"word": 1 << 21}], 3),
+        ("program", [{"word": 6}, {"word": 6}], 3),
+        ("program", [{"word": 0}] * 3, 4),
+        ("keep", [{"old": formats.NEW}] * 2, 1),
+    ],
+)
+def test_part_with_a_bad_item_is_refused(loaded, name, items, detail):
+    session, first_taps = loaded
+    *before, (_, fields, _) = order_of(name)
+    for part in before:
+        assert refused(session, *part) is None
+    assert refused(session, name, fields, items) == (messages.RANGE, detail)
+    assert play(session) == first_taps
+
+
+def test_tables_of_another_frame_rate_are_not_exchanged_while_the_motion_runs(mcu):
     session = begin_performance(mcu)
-    for name, fields, items in list(wide_tables())[:-1]:
-        fields = fields | {"frame_rate_hz": 31} if name == "begin" else fields
+    (_, begin, _), *parts, _ = wide_tables()
+    for name, fields, items in [("begin", begin | {"frame_rate_hz": 31}, []), *parts]:
         assert refused(session, name, fields, items) is None
     assert refused(session, "commit") == (messages.STATE, 0)
     with UnixMcu() as other:
@@ -372,9 +393,9 @@ def test_tables_of_another_frame_rate_are_refused_while_the_motion_runs(mcu):
 
 def test_commands_that_the_state_forbids_are_refused(mcu):
     session = open_session(VirtualCarrier(mcu))
-    for name in ("start", "arm", "commit", "dof", "output", "action", "live", "curve", "program", "blink"):
+    for name in ("start", "arm", "commit", "dof", "output", "action", "live", "curve", "program", "blink", "keep"):
         fields = GOOD.get(name, {})
-        assert refused(session, name, fields, ITEMS.get(name))[0] == messages.STATE, name
+        assert refused(session, name, fields)[0] == messages.STATE, name
     assert refused(session, "mappings", {"first_mapping": 0}, [GOOD["mapping"]])[0] == messages.STATE
     assert session.status()["frame"] == -1
     parts = [part for part in pet_tables().messages() if part[0] != "output"]
@@ -423,9 +444,9 @@ def raw(session, message_id, payload):
         ("live_targets", 5, [{"live": 16, "target_q28": 0}], 1),
         ("live_targets", 5, [{"live": 0, "target_q28": (1 << 28) + 1}], 2),
         ("tempo", 5, [{"action": 64, "tempo_q16": 65536}], 1),
+        ("tempo", 5, [{"action": 0, "tempo_q16": 65536}, {"action": 255, "tempo_q16": 65536}], 3),
         ("tempo", 5, [{"action": 0, "tempo_q16": 3276}], 2),
         ("tempo", 5, [{"action": 0, "tempo_q16": 524289}], 2),
-        ("tempo", 5, [{"action": 0, "tempo_q16": 65536}, {"action": 255, "tempo_q16": 65536}], 3),
         ("tempo", 5, [{"action": 255, "tempo_q16": 16383}], 2),
         ("tempo", 5, [{"action": 255, "tempo_q16": 262145}], 2),
         ("tempo", 5, [{"action": 255, "tempo_q16": 0x80000000}], 2),

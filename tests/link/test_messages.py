@@ -28,8 +28,8 @@ COUNTS = {
         "kind",
         "pin",
     ),
-    *("curve", "curves", "samples", "program", "programs", "words", "word", "blink", "blinks", "first", "old"),
-    *("entry", "cycles"),
+    *("curve", "curves", "samples", "program", "programs", "words", "word", "blink", "blinks", "entry", "cycles"),
+    *("first", "old"),
     *("pulse0_q4us", "pulse1_q4us", "taps", "taps_every", "weights_every", "packets", "damaged"),
     *("dofs_max", "actions_max", "mappings_max", "lives_max", "queue_max", "late_frames", "late_targets", "heap_free"),
 }

@@ -27,11 +27,11 @@ from tests.reference import ReferencePuppet
 
 PUPPETS = Path(__file__).parents[2] / "puppets"
 QUICK_SEEDS, QUICK_SECONDS = range(30), 10
-SOAK_SEEDS, SOAK_SECONDS = range(1000, 1400), 40
+SOAK_SEEDS, SOAK_SECONDS = range(1000, 1400), 20
 PET_SECONDS = 21
 SETTLING_TAUS = 18
 CORNERS = [*corners(), *full_corners()]
-DRAWS = 8
+DRAWS = 20
 """Cases that are drawn for one seed before it counts as hopeless."""
 
 

@@ -171,7 +171,7 @@ def test_tables_share_equal_functions(function_tables):
 
 def test_tables_long_curves_come_in_parts(function_tables):
     curves = messages_named(function_tables, "curve")
-    assert [(fields["curve"], fields["samples"]) for fields, _ in curves] == [(0, 3), (1, 256), (1, 256), (1, 256)]
+    assert [(fields["curve"], fields["samples"]) for fields, _ in curves] == [(0, 3)] + 8 * [(1, 256)]
     assert [item["value_q15"] for item in curves[0][1]] == [0, 32768, 8192]
     samples_q15 = [item["value_q15"] for _, items in curves[1:] for item in items]
     assert samples_q15 == [fixed(float(f"{i / 255:.6f}"), 15) for i in range(256)]
