@@ -171,3 +171,11 @@ def test_streams_begin_as_defined():
             blinks.seed_next(seed, mapping)
             found = blinks._next_high[mapping] << 16 | blinks._next_low[mapping]
             assert found == reference.stream_start(seed, 256 + mapping)
+
+
+@given(st.lists(words_16, min_size=1, max_size=12), st.data())
+def test_streams_are_copied_as_far_as_there_are_mappings(source, data):
+    count = data.draw(st.integers(0, len(source)))
+    target = halves([7] * len(source))
+    MODULE._copy(count, halves(source), target)
+    assert list(target) == source[:count] + [7] * (len(source) - count)
