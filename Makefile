@@ -53,8 +53,7 @@ bench: setup ## what a frame costs on the emulated RP2040
 	$(VENV)/python tools/bench.py $(ARGS)
 
 mutants: setup ## plant faults in the firmware and see each one found by its test
-	@tools/prepare.sh
-	$(VENV)/python tools/mutants.py $(ARGS)
+	$(call with_images, $(VENV)/python tools/mutants.py $(ARGS), $(VENV)/python tools/mutants.py $(ARGS))
 
 emulator-suite: setup ## run MicroPython's own test suite on the emulated RP2040
 	@tools/prepare.sh

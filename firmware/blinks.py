@@ -10,7 +10,7 @@ import micropython
 from micropython import const
 
 from firmware.tables import halves, words
-from shared.formats import FUNCTION_BLINK, MAPPINGS_MAX
+from shared.formats import MAPPINGS_MAX
 
 _RTRIGSIN = const(8)
 _BLINKING = const(1)  # flags of a mapping
@@ -92,6 +92,15 @@ def _evaluate(
 
 
 @micropython.viper
+def _copy(count: int, source: ptr16, target: ptr16):
+    """Copy 16-bit words."""
+    m = 0
+    while m < count:
+        target[m] = source[m]
+        m += 1
+
+
+@micropython.viper
 def _carry(count: int, old_mapping: ptr16, values: ptr16, fresh: ptr16, scratch: ptr32):
     """Let `values[m]` be what `values[old_mapping[m]]` was, or `fresh[m]` where that is 0xFFFF."""
     m = 0
@@ -131,6 +140,8 @@ class Blinks:
     def __init__(self):
         self._next_low = halves(MAPPINGS_MAX)
         self._next_high = halves(MAPPINGS_MAX)
+        self._first_low = halves(MAPPINGS_MAX)  # what the streams of the tables that play began with
+        self._first_high = halves(MAPPINGS_MAX)
         self._stream_low = halves(MAPPINGS_MAX)
         self._stream_high = halves(MAPPINGS_MAX)
         self._start_q18 = words(MAPPINGS_MAX)
@@ -145,18 +156,18 @@ class Blinks:
     def exchange(self, tables, old_mapping, scratch):
         """Take over the prepared streams, but go on with the state of `old_mapping[m]` where that is not 0xFFFF."""
         count = tables.mappings
+        _copy(count, self._next_low, self._first_low)
+        _copy(count, self._next_high, self._first_high)
         _carry(count, old_mapping, self._stream_low, self._next_low, scratch)
         _carry(count, old_mapping, self._stream_high, self._next_high, scratch)
         _carry_states(count, old_mapping, self._start_q18, self._flags, scratch)
 
     def rest(self, tables):
-        """Begin all streams anew, all idle. Allocates large integers: not for the performance."""
+        """Begin all streams anew, all idle."""
+        _copy(tables.mappings, self._first_low, self._stream_low)
+        _copy(tables.mappings, self._first_high, self._stream_high)
         for mapping in range(tables.mappings):
             self._flags[mapping] = _LONG_AGO
-            if tables.function[mapping] >= FUNCTION_BLINK:
-                self.seed_next(tables.seed, mapping)
-                self._stream_low[mapping] = self._next_low[mapping]
-                self._stream_high[mapping] = self._next_high[mapping]
 
     def enter(self, tables, action):
         """Let an action's blinks be idle, their last one long ago; their streams go on."""

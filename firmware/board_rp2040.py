@@ -16,6 +16,7 @@ from micropython import const
 
 _UART_BAUD = const(115200)
 _LAST_PIN = const(28)
+_RETURN = const(13)
 _CTRL_C = const(3)
 _PWM_WORD = const(0x10014000)  # address of the PWM block, 0x40050000, in words
 _SLICE_WORDS = const(5)
@@ -97,7 +98,7 @@ class Board:
     def receive(self, buffer):
         """Read what has arrived into `buffer`, at most its length; return the number of bytes. Never waits.
 
-        Over USB a Ctrl-C (0x03) is the last byte of a read: if it calls for the REPL, what follows is meant for that.
+        Over USB `0D 03` ends a read: if it calls for the REPL, what follows is meant for that.
         """
         count = 0
         room = len(buffer)
@@ -111,7 +112,7 @@ class Board:
             self._stdin.readinto(byte)
             buffer[count] = byte[0]
             count += 1
-            if byte[0] == _CTRL_C:
+            if byte[0] == _CTRL_C and (count == 1 or buffer[count - 2] == _RETURN):
                 break
         if count:
             self._to_uart = False

@@ -18,6 +18,7 @@ from firmware.clock import TICKS_MASK
 
 _RECORD = const(7)
 _ROOM = const(4096)
+_RETURN = const(13)
 _CTRL_C = const(3)
 
 
@@ -60,7 +61,7 @@ class Board:
     def receive(self, buffer):
         """Read what has arrived into `buffer`, at most its length; return the number of bytes. Never waits.
 
-        A Ctrl-C (0x03) is the last byte of a read: if it calls for the REPL, what follows is meant for that.
+        `0D 03` ends a read: if it calls for the REPL, what follows is meant for that.
         """
         count = 0
         room = len(buffer)
@@ -70,7 +71,7 @@ class Board:
             count += 1
             self._at += 1
             self._count -= 1
-            if byte == _CTRL_C:
+            if byte == _CTRL_C and (count == 1 or buffer[count - 2] == _RETURN):
                 break
         return count
 

@@ -35,7 +35,7 @@ class Repl:
         self._board = board
         self._byte = bytearray(1)
         self._names = {"__name__": "__main__"}
-        sys.modules["machine"] = _Machine()
+        sys.modules["machine"] = _Machine()  # type: ignore[assignment]  # all of the module that is needed
 
     def run(self):
         """Serve until Ctrl-D in friendly mode, or `machine.reset()`."""

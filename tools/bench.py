@@ -99,6 +99,15 @@ for layer in layers:
     print(layer.times)
 """
 
+MEASURE_TELEMETRY = """
+from firmware.link import Link
+link = Link(board, puppet)
+link.silent = False
+link._taps, link._taps_every, link._weights_every = 7, 1, 1
+board.send = empty_for((0, 0))
+print(frames(lambda _: link.report()))
+"""
+
 RECEIVE = """
 time.sleep_ms(4)
 begun = time.ticks_us()
@@ -120,7 +129,9 @@ def measure_layers(repl: RawRepl) -> list[Cost]:
     pairs = ", ".join(f'({place}, "{name}")' for place, name in LAYERS.values())
     printed = numbers(repl.exec(MEASURE_LAYERS.format(layers=pairs, frames=FRAMES), PATIENCE_US))
     layers = [Cost.of(name, times) for name, times in zip(LAYERS, printed, strict=True)]
-    return [*layers, frame[ACTIONS], Cost("an idle action in it", idle_us, idle_us)]
+    (times,) = numbers(repl.exec(MEASURE_TELEMETRY, PATIENCE_US))
+    telemetry = Cost.of("taps and weights of it, packed", times, statistics.median(overhead))
+    return [*layers, frame[ACTIONS], Cost("an idle action in it", idle_us, idle_us), telemetry]
 
 
 def measure_receiving(repl: RawRepl) -> Cost:

@@ -3,7 +3,8 @@
 `Link` does the protocol and nothing else: it is handed a carrier for its bytes and its clock, so the same code works in
 real time over a serial port and in virtual time with an emulated MCU.
 
-Commands are numbered and carried out by the MCU in their order, each once; up to WINDOW of them are under way. What is
+Commands are numbered and carried out by the MCU in their order, each once; up to WINDOW of them, and of WINDOW_BYTES
+unless a single one has more, are under way. What is
 not acknowledged within RETRY_US is sent again, with all that follow it. Telemetry is not acknowledged: what is lost of
 it is lost.
 """
@@ -21,12 +22,23 @@ from marotte.mcu.base import VirtualMcu
 from shared import codec, messages
 
 WINDOW = 8
+URGENT_WINDOW = 12
+"""The same for urgent ones; the MCU remembers its last 16 answers."""
+
+WINDOW_BYTES = 300
+"""The MCU takes some 40 us for a byte. With no more on the way, a command that may not wait is carried out in time, and
+none is repeated only because those before it are still being read.
+"""
+
 RETRY_US = 100_000
 HURRY_US = 5_000
 """A gap that the MCU reports is filled at once, but not twice within this: all that follow it report it too."""
 
 SILENT_US = 1_000_000
 """With commands under way and no packet for so long, the MCU counts as gone."""
+
+WIRE_OVERHEAD = codec.OVERHEAD + 2
+"""What a packet has on the wire beside its payload."""
 
 _BY_NAME = {message[0]: message for message in messages.MESSAGES}
 _BY_ID = {message[1]: message for message in messages.MESSAGES}
@@ -108,12 +120,13 @@ class Counters:
 
 @dataclass
 class _Command:
-    seq: int
     name: str
-    packet: bytes
-    sent_us: int
-    repeated: bool
+    payload: bytes
     on_refused: Callable[[int, int], None] | None
+    seq: int = 0
+    packet: bytes = b""  # made when it is sent, and numbered then
+    sent_us: int = 0
+    repeated: bool = False
 
 
 def pack(name: str, fields: dict[str, int], items: list[dict[str, int]] | None = None) -> bytes:
@@ -177,15 +190,23 @@ class Link:
         fields: dict[str, int] | None = None,
         items: list[dict[str, int]] | None = None,
         on_refused: Callable[[int, int], None] | None = None,
+        *,
+        urgent: bool = False,
     ) -> None:
-        """Send a command, at once if the window allows.
+        """Send a command, at once if the window allows; an urgent one at once anyway, before those that wait.
 
         `on_refused(status, detail)` is called if the MCU refuses it; without, `pump` raises LinkRefused.
         """
-        packet = wire_packet(_BY_NAME[name][1], self._seq, pack(name, fields or {}, items))
-        self._backlog.append(_Command(self._seq, name, packet, 0, False, on_refused))
-        self._seq = (self._seq + 1) & 255
-        self._send_what_fits()
+        command = _Command(name, pack(name, fields or {}, items), on_refused)
+        if urgent and len(self._under_way) < URGENT_WINDOW:
+            self._send(command)
+        else:
+            self._backlog.append(command)
+            self._send_what_fits()
+
+    def withdraw(self, name: str) -> None:
+        """Drop the commands of this name that have not been sent yet."""
+        self._backlog = deque(command for command in self._backlog if command.name != name)
 
     def pump(self, wait_us: int) -> None:
         """Let at most `wait_us` pass; take what has come, repeat what was lost. Raises LinkSilent and LinkRefused."""
@@ -213,14 +234,24 @@ class Link:
         self._refusals.clear()
 
     def _send_what_fits(self) -> None:
+        room = WINDOW_BYTES - sum(len(command.packet) for command in self._under_way)
+        while self._backlog and len(self._under_way) < WINDOW:
+            command = self._backlog[0]
+            room -= len(command.payload) + WIRE_OVERHEAD
+            if room < 0 and self._under_way:
+                break
+            self._send(self._backlog.popleft())
+
+    def _send(self, command: _Command) -> None:
         if not self._under_way:
             self.heard_us = self._carrier.now_us()  # silence begins with the first command that waits for an answer
-        while self._backlog and len(self._under_way) < WINDOW:
-            command = self._backlog.popleft()
-            command.sent_us = self._carrier.now_us()
-            self._under_way.append(command)
-            self._carrier.write(command.packet)
-            self.counters.sent += 1
+        command.seq = self._seq
+        command.packet = wire_packet(_BY_NAME[command.name][1], command.seq, command.payload)
+        command.sent_us = self._carrier.now_us()
+        self._seq = (self._seq + 1) & 255
+        self._under_way.append(command)
+        self._carrier.write(command.packet)
+        self.counters.sent += 1
 
     def _repeat(self, now_us: int) -> None:
         for command in self._under_way:

@@ -131,8 +131,10 @@ class Session:
         self._post("arm")
 
     def kill(self) -> None:
-        """Take all pulses away."""
-        self._post("kill")
+        """Take all pulses away, before anything else that has not been sent yet; an `arm` among that is withdrawn."""
+        self.link.withdraw("arm")
+        self._posted_us = self.carrier.now_us()
+        self.link.post("kill", urgent=True)
 
     def weight_targets(
         self, frame: int, targets_q28: dict[int, int], on_refused: Callable[[int, int], None] | None = None

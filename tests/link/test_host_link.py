@@ -8,7 +8,10 @@ from marotte.link import (
     HURRY_US,
     RETRY_US,
     SILENT_US,
+    URGENT_WINDOW,
     WINDOW,
+    WINDOW_BYTES,
+    WIRE_OVERHEAD,
     Link,
     LinkRefused,
     LinkSilent,
@@ -53,6 +56,53 @@ def test_link_keeps_no_more_than_its_window_under_way():
     settle(link)
     assert [seq for _, seq, _ in carrier.arrived] == list(range(3 * WINDOW))
     assert link.counters.repeated == 0
+
+
+def test_link_keeps_few_bytes_under_way():
+    link, carrier, _ = link_to(faithful)
+    items = [{"live": 0, "target_q28": 1}] * 20
+    for _ in range(10):
+        link.post("live_targets", {"frame": -1}, items)
+    size = 4 + 20 * 5 + WIRE_OVERHEAD
+    assert len(carrier.arrived) == WINDOW_BYTES // size
+    link.post("live_targets", {"frame": -1}, [*items, *items])
+    settle(link)
+    assert [seq for _, seq, _ in carrier.arrived] == list(range(11))
+
+
+def test_link_sends_a_command_that_is_longer_than_its_window(monkeypatch):
+    monkeypatch.setattr("marotte.link.WINDOW_BYTES", 20)
+    link, carrier, _ = link_to(faithful)
+    for _ in range(3):
+        link.post("live_targets", {"frame": -1}, [{"live": 0, "target_q28": 1}] * 40)
+    assert len(carrier.arrived) == 1
+    settle(link)
+    assert len(carrier.arrived) == 3
+
+
+def test_kill_overtakes_what_is_not_sent_and_withdraws_an_arm():
+    carrier = ScriptedCarrier(faithful)
+    session = Session(carrier)
+    for _ in range(WINDOW + 2):
+        session.start()
+    session.arm()
+    session.kill()
+    session.stop()
+    sent = [message_id for message_id, _, _ in carrier.arrived]
+    assert sent == [messages.START] * WINDOW + [messages.KILL]
+    session.flush()
+    sent = [message_id for message_id, _, _ in carrier.arrived]
+    assert sent[WINDOW + 1 :] == [messages.START, messages.START, messages.STOP]
+    assert [seq for _, seq, _ in carrier.arrived] == list(range(WINDOW + 4))
+
+
+def test_urgent_commands_wait_where_the_mcu_could_not_remember_so_many():
+    link, carrier, _ = link_to(faithful)
+    for _ in range(3 * URGENT_WINDOW):
+        link.post("kill", urgent=True)
+    assert len(carrier.arrived) == URGENT_WINDOW
+    settle(link)
+    assert len(carrier.arrived) == 3 * URGENT_WINDOW
 
 
 def test_link_numbers_commands_modulo_256():

@@ -35,6 +35,7 @@ STAND_US = 1500
 FULL_US = 2000
 LINK_TIMEOUT_US = 500_000
 STOP_US = 300_000
+KILL_US = 20_000
 KINDS = ("unix", pytest.param("rp2040", marks=pytest.mark.images))
 
 
@@ -184,3 +185,21 @@ def test_tables_that_are_loaded_anew_take_the_pulses_away(playing, tables):
     play(session, 200_000)
     assert all(widths_us(mcu, pin, loaded_us) == [] for pin in PINS)
     assert not session.status()["armed"]
+
+
+def test_kill_acts_within_20_ms_whatever_else_is_under_way(playing):
+    mcu, session = playing
+    for number in range(8):
+        drive(session)
+        play(session, 1000 * number + 137)
+        for target in range(16):
+            items = [{"action": 0, "target_q28": 1000 * target}] * 48
+            session.link.post("weight_targets", {"frame": formats.FRAME_NOW}, items, on_refused=lambda *_: None)
+        session.arm()
+        session.kill()
+        mcu.run_for(KILL_US)
+        mcu.clear_edges()
+        play(session, 200_000)
+        assert all(mcu.edges(pin) == [] for pin in PINS)
+        session.flush()
+        assert not session.status()["armed"]

@@ -64,7 +64,7 @@ class TailCarrier(VirtualCarrier):
 
     def read(self, wait_us):
         data = super().read(wait_us)
-        self.tail = (self.tail + data)[-2000:]
+        self.tail = (self.tail + data)[-20000:]
         return data
 
 
@@ -95,7 +95,8 @@ def converse(mcu, session, frames):
             targets = {action: rng.randrange(formats.WEIGHT_MAX) for action in range(len(puppet.actions))}
             session.weight_targets(session.weights[0] + 10, targets)
         if step % 40 == 8:
-            session.tempo(formats.FRAME_NOW, rng.randrange(formats.TEMPO_ONE // 2, 2 * formats.TEMPO_ONE))
+            tempo_q16 = rng.randrange(formats.TEMPO_ONE // 2, 2 * formats.TEMPO_ONE)
+            session.tempo(formats.FRAME_NOW, rng.choice((0, 1, 2, formats.MASTER)), tempo_q16)
         if step % 40 == 9:
             assert session.status()["late_max_us"] < LATE_MAX_US
         if step % 200 == 10:

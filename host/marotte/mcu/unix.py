@@ -53,7 +53,7 @@ class UnixMcu(VirtualMcu):
         self._waiting: list[tuple[int, bytes]] = []
         self._sent: list[tuple[int, bytes]] = []
         self._pins: dict[int, _PwmPin] = {}
-        self._errors = tempfile.TemporaryFile()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         command_read, self._commands = os.pipe()
         self._records, record_write = os.pipe()
         words = [self._binary, "-X", f"heapsize={HEAP_BYTES}", "-m", "firmware.unix_main"]
