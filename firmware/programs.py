@@ -98,7 +98,8 @@ def _evaluate(
     """Write the values of all programs of the playing actions.
 
     Values are Q16 and saturate at -16..16; on the stack they stand with 2^21 added. A phase `a * t + b` is `a_q4` times
-    the fraction in Q22, within 2^30, in sixteenths of whole cycles. Bits: a product has limbs of 11 + 10 bits and 21, so at most 2^30.
+    the fraction in Q22, within 2^30, in sixteenths of whole cycles. Bits: a product has limbs of 11 + 10
+    bits and 21, so at most 2^30.
     """
     n = 0
     while n < found:
