@@ -1,9 +1,9 @@
 """Blinks: the paper's Random Triggered Sine, and its continuous sister.
 
-While it does not blink the value is 1. In every frame in which its action's weight is above 0 each mapping draws once from its
-own xorshift stream; above the threshold, and if the last blink began longer ago than the least gap, it blinks for one period: `rtrigsin`
-along the raised sine, as in the paper, which jumps to 1/2 at the beginning, `blink` along the raised cosine, which does not jump.
-"Longer" means by more than 1/1024 period; the time since the last blink saturates at 2048 periods.
+While it does not blink the value is 1. In every frame in which its action's weight is above 0 each mapping draws once from
+its own xorshift stream; above the threshold, and if the last blink began longer ago than the least gap, it blinks for one
+period: `rtrigsin` along the raised sine, as in the paper, which jumps to 1/2 at the beginning, `blink` along the raised
+cosine, which does not jump. "Longer" means by more than 1/1024 period; the time since the last blink saturates at 2048 periods.
 """
 
 import micropython

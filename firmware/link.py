@@ -399,7 +399,8 @@ class Link:
             self._send(messages.TAPS, length)
         if self._weights_every and frame % self._weights_every == 0:
             self._pack_frame(frame)
-            self._send(messages.WEIGHTS, _pack_weights(out, 6, puppet.actions.found, puppet.actions.playing, puppet.actions.w_q28))
+            actions = puppet.actions
+            self._send(messages.WEIGHTS, _pack_weights(out, 6, actions.found, actions.playing, actions.w_q28))
 
     def _pack_frame(self, frame):
         pack_into("<i", self._out, _PAYLOAD, frame)

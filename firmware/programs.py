@@ -97,8 +97,9 @@ def _evaluate(
 ):
     """Write the values of all programs of the playing actions.
 
-    Values are Q16 and saturate at -16..16; on the stack they stand with 2^21 added. A phase `a * t + b` is `a_q4` times the fraction in
-    Q22, within 2^30, in sixteenths of whole cycles. Bits: a product has limbs of 11 + 10 bits and 21, so at most 2^30.
+    Values are Q16 and saturate at -16..16; on the stack they stand with 2^21 added. A phase `a * t + b` is `a_q4` times
+    the fraction in Q22, within 2^30, in sixteenths of whole cycles. Bits: a product has limbs of 11 + 10
+    bits and 21, so at most 2^30.
     """
     n = 0
     while n < found:
@@ -241,7 +242,7 @@ class Programs:
         _evaluate(
             actions.playing, actions.found, actions.cycle, actions.fraction_q24, tables.first_mapping,
             tables.mapping_count, tables.function, tables.argument, tables.same, tables.program_start,
-            tables.program_words, tables.pool, sine, gradients, live_q28, tables.curve_start, tables.curve_samples, tables.samples_q15,
-            self._stack, value_q15,
+            tables.program_words, tables.pool, sine, gradients, live_q28, tables.curve_start, tables.curve_samples,
+            tables.samples_q15, self._stack, value_q15,
         )
         # fmt: on

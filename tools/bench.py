@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import statistics
 import tempfile
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+
+from bench_parts import measure_exchange, measure_functions
+from bench_stage import ACTIONS, DOFS, FRAMES, MAPPINGS, PATIENCE_US, PLAYING, SETUP, Cost, Stage, numbers, play
 
 from marotte.images import rp2040_image
 from marotte.link import VirtualCarrier, pack, wire_packet
@@ -22,53 +23,27 @@ from marotte.mcu.rp2040 import Rp2040Mcu
 from marotte.session import DICTIONARY, Session
 from shared import formats, messages
 
-DOFS = 10
-ACTIONS = 30
-PLAYING = 6
-MAPPINGS = 6
-RATE_HZ = 30
-FUNCTIONS = (formats.FUNCTION_NOISE, formats.FUNCTION_NOISE, formats.FUNCTION_RSIN, formats.FUNCTION_RCOS)
-FRAMES = 100
 PERFORMANCE_FRAMES = 300
 CHUNK_BYTES = 32
 CHUNKS = 20
-LINES_AT_ONCE = 40
-PATIENCE_US = 30_000_000
 
 LAYERS = {
     "cues": ("puppet.cues", "apply"),
     "HOLD's targets": ("compositor", "hold_targets"),
     "weights": ("weights", "integrate"),
-    "which actions play": ("actions", "select"),
-    "phases": ("actions", "phases"),
+    "which actions play": ("actions", "_select"),
+    "phases": ("actions", "_phases"),
+    "ends of gestures": ("actions", "_end_gestures"),
+    "which targets rise": ("actions", "_risen"),
     "functions": ("functions", "evaluate"),
+    "repeated functions": ("functions", "repeat"),
     "compositor": ("compositor", "blend"),
     "motor": ("puppet.motor", "move"),
     "  PWM in it": ("board", "pulses"),
+    "warping": ("actions", "_warp"),
     "master phase": ("clock", "advance"),
 }
 """Line of the table, and the call that it measures: what it is an attribute of, and its name."""
-
-SETUP = """
-import gc, micropython, time
-from firmware import actions, clock, compositor, functions, weights
-from firmware.board_rp2040 import Board
-from firmware.puppet import Puppet
-board = Board()
-puppet = Puppet(board)
-staged = puppet.staged
-"""
-
-PLAY = """
-puppet.commit()
-staged = puppet.staged
-puppet.motor.arm()
-puppet.start()
-for action in range({playing}):
-    puppet.weight_target_q28[action] = (1 << 28) - 1000 * action
-for _ in range(60):
-    puppet.step(False)
-"""
 
 MEASURE_FRAMES = """
 def frames(call):
@@ -142,85 +117,12 @@ print(took, count)
 """
 
 
-@dataclass(frozen=True)
-class Cost:
-    """A line of the table; times in microseconds."""
-
-    name: str
-    median_us: float
-    greatest_us: float
-
-    @classmethod
-    def of(cls, name: str, times_us: list[float], overhead_us: float = 0) -> Cost:
-        return cls(name, statistics.median(times_us) - overhead_us, max(times_us) - overhead_us)
-
-
-class Stage:
-    """The puppet that is measured, as the messages of an upload."""
-
-    def __init__(self, actions: int):
-        self._actions = actions
-
-    def messages(self) -> Iterator[tuple[str, dict[str, int], list[dict[str, int]]]]:
-        """Yield the upload's messages in their order."""
-        alpha_q26 = formats.ALPHA_ONE >> 3
-        begin = (RATE_HZ, DOFS, self._actions, self._actions * MAPPINGS, 0, 1999, 0, alpha_q26, 500)
-        yield self._message("begin", *begin)
-        for dof in range(DOFS):
-            yield self._message("dof", dof, formats.KIND_ABSOLUTE, formats.VALUE_ONE // 2, 0, formats.VALUE_ONE)
-            yield self._message("output", dof, 2 + dof, 16000, 32000)
-        for action in range(self._actions):
-            tempo_q16 = 50000 + 7 * action
-            yield self._message("action", action, tempo_q16, alpha_q26, alpha_q26, MAPPINGS * action, MAPPINGS)
-        items = [name for name, _ in messages.find(messages.MAPPINGS)[3]]
-        for action in range(self._actions):
-            values = [self._mapping(action, number) for number in range(MAPPINGS)]
-            entries = [dict(zip(items, entry, strict=True)) for entry in values]
-            yield "mappings", {"first_mapping": MAPPINGS * action}, entries
-        yield "commit", {}, []
-
-    def program(self) -> Iterator[str]:
-        """Yield the same as lines of Python for the MCU's own tables, without the commit."""
-        for name, fields, items in self.messages():
-            values = ", ".join(str(value) for value in fields.values())
-            if name == "mappings":
-                first = fields["first_mapping"]
-                for number, item in enumerate(items):
-                    yield f"assert staged.mapping({first + number}, *{tuple(item.values())}) is None"
-            elif name != "commit":
-                yield f"assert staged.{name}({values}{', board' if name == 'output' else ''}) is None"
-
-    @staticmethod
-    def _message(name: str, *values: int) -> tuple[str, dict[str, int], list[dict[str, int]]]:
-        fields = messages.find(getattr(messages, name.upper()))[2]
-        return name, dict(zip([field for field, _ in fields], values, strict=True)), []
-
-    @staticmethod
-    def _mapping(action: int, number: int) -> tuple[int, ...]:
-        code = FUNCTIONS[number % len(FUNCTIONS)]
-        argument = (action + number) % formats.NOISE_TABLES if code == formats.FUNCTION_NOISE else 0
-        return (action + number) % DOFS, code, argument, 100 * action, formats.VALUE_ONE - 500 * number
-
-
-def numbers(printed: str) -> list[list[float]]:
-    """Return the lists of numbers that were printed, a line each."""
-    return [[float(word) for word in line.strip("[]").split(",")] for line in printed.split("\r\n") if line]
-
-
-def load(repl: RawRepl, actions: int) -> None:
-    """Load the stage on the MCU and play it until all weights are there."""
-    lines = list(Stage(actions).program())
-    for start in range(0, len(lines), LINES_AT_ONCE):
-        repl.exec("\n".join(lines[start : start + LINES_AT_ONCE]), PATIENCE_US)
-    repl.exec(PLAY.format(playing=PLAYING), PATIENCE_US)
-
-
 def measure_layers(repl: RawRepl) -> list[Cost]:
     """Measure the whole frame, an idle action, and every layer by itself."""
     repl.exec(SETUP, PATIENCE_US)
     frame = {}
     for actions in (2 * ACTIONS, ACTIONS):
-        load(repl, actions)
+        play(repl, Stage(actions))
         overhead, times = numbers(repl.exec(MEASURE_FRAMES.format(frames=FRAMES), PATIENCE_US))
         frame[actions] = Cost.of("the whole frame", times, statistics.median(overhead))
     idle_us = (frame[2 * ACTIONS].median_us - frame[ACTIONS].median_us) / ACTIONS
@@ -276,6 +178,11 @@ def main() -> None:
     with Rp2040Mcu(image.path, timed_flash=False) as mcu:
         repl = RawRepl(mcu)
         costs = [*measure_layers(repl), measure_receiving(repl)]
+    with Rp2040Mcu(image.path, timed_flash=False) as mcu:
+        repl = RawRepl(mcu)
+        repl.exec(SETUP, PATIENCE_US)
+        functions = measure_functions(repl)
+        exchange = measure_exchange(repl)
         clk_hz = mcu.report()["clk_hz"]
     with tempfile.TemporaryDirectory() as folder:
         flash = Path(folder) / "flash.bin"
@@ -288,9 +195,10 @@ def main() -> None:
         f"RP2040 at {clk_hz / 1e6:g} MHz, emulated, without misses of the flash cache; {DOFS} DOFs, {ACTIONS} actions,"
     )
     print(f"{PLAYING} playing, {MAPPINGS} mappings each; {FRAMES} frames, pulses on all DOFs")
-    print(f"\n{'':32}{'median us':>10}{'max us':>10}")
-    for cost in costs:
-        print(f"{cost.name:32}{cost.median_us:10.1f}{cost.greatest_us:10.1f}")
+    for title, some in (("", costs), ("one evaluation", functions), ("an exchange of tables", exchange)):
+        print(f"\n{title:32}{'median us':>10}{'max us':>10}")
+        for cost in some:
+            print(f"{cost.name:32}{cost.median_us:10.1f}{cost.greatest_us:10.1f}")
     print(f"\nin a performance with all telemetry every frame, {PERFORMANCE_FRAMES} frames")
     print(f"{'the whole frame':32}{'':10}{told['frame_max_us']:10.1f}")
     print(f"{'a frame begun late':32}{'':10}{told['late_max_us']:10.1f}")

@@ -28,9 +28,6 @@ SMALL_INT_FUNCTIONS = (
     *(f"Exchange.{name}" for name in ("carry_over", "_swap")),
     *(f"Motor.{name}" for name in ("load", "move", "stand", "arm", "kill", "_write")),
     *(f"Puppet.{name}" for name in ("start", "stop", "prepare", "step", "_synthesise", "_rest")),
-    *(f"Actions.{name}" for name in ("compute_phases", "follow_tempos", "end_gestures", "enter", "warp", "_place")),
-    *(f"Blinks.{name}" for name in ("enter", "evaluate", "exchange")),
-    *(f"Exchange.{name}" for name in ("carry_over", "_swap")),
     *(
         f"Link.{name}"
         for name in ("poll", "_packet", "_carry_out", "_queue", "report", "_pack_frame", "_answer", "_send")

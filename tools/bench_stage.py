@@ -1,0 +1,156 @@
+"""The puppet that `bench.py` measures, as the messages of an upload and as lines of Python for the MCU's own tables."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from marotte.mcu.raw_repl import RawRepl
+from shared import formats, messages, program
+
+DOFS = 10
+ACTIONS = 30
+PLAYING = 6
+MAPPINGS = 6
+FRAMES = 100
+RATE_HZ = 30
+LINES_AT_ONCE = 40
+PATIENCE_US = 30_000_000
+
+FUNCTIONS = (
+    (formats.FUNCTION_NOISE, None),
+    (formats.FUNCTION_NOISE, None),
+    (formats.FUNCTION_RSIN, 0),
+    (formats.FUNCTION_RCOS, 0),
+)
+"""Function and argument of the mappings of an action, in turn; None is another argument for each."""
+
+CURVE_SAMPLES = 64
+BLINK_THRESHOLD_Q16 = 0x8000
+BLINK_GAP_Q18 = 1 << 18
+
+_ARGUMENTS = {formats.FUNCTION_NOISE: formats.NOISE_TABLES}
+
+
+SETUP = """
+import gc, micropython, time
+from firmware import actions, clock, compositor, functions, weights
+from firmware.board_rp2040 import Board
+from firmware.puppet import Puppet
+board = Board()
+puppet = Puppet(board)
+staged = puppet.staged
+"""
+
+PLAY = """
+puppet.stop()
+puppet.commit()
+staged = puppet.staged
+puppet.motor.arm()
+puppet.start()
+for action in range({playing}):
+    puppet.actions.target_q28[action] = (1 << 28) - 1000 * action
+for _ in range(60):
+    puppet.step(False)
+"""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """A line of the table; times in microseconds."""
+
+    name: str
+    median_us: float
+    greatest_us: float
+
+    @classmethod
+    def of(cls, name: str, times_us: list[float], overhead_us: float = 0) -> Cost:
+        return cls(name, statistics.median(times_us) - overhead_us, max(times_us) - overhead_us)
+
+
+def numbers(printed: str) -> list[list[float]]:
+    """Return the lists of numbers that were printed, a line each."""
+    return [[float(word) for word in line.strip("[]").split(",")] for line in printed.split("\r\n") if line]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """So many actions with MAPPINGS mappings each; `functions` as FUNCTIONS. Programs differ only in their last constant."""
+
+    actions: int
+    functions: Sequence[tuple[int, int | None]] = FUNCTIONS
+    words: Sequence[int] = (program.CONST, 0)
+
+    def messages(self) -> Iterator[tuple[str, dict[str, int], list[dict[str, int]]]]:
+        """Yield the upload's messages in their order."""
+        alpha_q26 = formats.ALPHA_ONE >> 3
+        kinds = {kind for kind, _ in self.functions}
+        curves = MAPPINGS if formats.FUNCTION_CURVE in kinds or program.CURVE in self.words else 0
+        programs = MAPPINGS if formats.FUNCTION_PROGRAM in kinds else 0
+        blinks = MAPPINGS if kinds & {formats.FUNCTION_BLINK, formats.FUNCTION_RTRIGSIN} else 0
+        # fmt: off
+        yield _message(
+            "begin", RATE_HZ, DOFS, self.actions, self.actions * MAPPINGS, 1, curves, programs, blinks, 1999, 0, alpha_q26, 500
+        )
+        # fmt: on
+        for dof in range(DOFS):
+            yield _message("dof", dof, formats.KIND_ABSOLUTE, formats.VALUE_ONE // 2, 0, formats.VALUE_ONE)
+            yield _message("output", dof, 2 + dof, 16000, 32000)
+        for action in range(self.actions):
+            tempo_q16 = 50000 + 7 * action
+            entry = (formats.ENTRY_START, alpha_q26, 0)
+            yield _message("action", action, tempo_q16, alpha_q26, alpha_q26, MAPPINGS * action, MAPPINGS, *entry)
+        items = [name for name, _ in messages.find(messages.MAPPINGS)[3]]
+        for action in range(self.actions):
+            values = [self._mapping(action, number) for number in range(MAPPINGS)]
+            entries = [dict(zip(items, entry, strict=True)) for entry in values]
+            yield "mappings", {"first_mapping": MAPPINGS * action}, entries
+        yield _message("live", 0, formats.WEIGHT_ONE // 2, alpha_q26, alpha_q26)
+        for curve in range(curves):
+            samples = [{"value_q15": 500 * n + curve} for n in range(CURVE_SAMPLES)]
+            yield "curve", {"curve": curve, "samples": CURVE_SAMPLES}, samples
+        for number in range(programs):
+            words = [*self.words, program.CONST, number, program.ADD]
+            yield "program", {"program": number, "words": len(words)}, [{"word": word} for word in words]
+        for blink in range(blinks):
+            yield _message("blink", blink, BLINK_THRESHOLD_Q16, BLINK_GAP_Q18)
+        yield "commit", {}, []
+
+    def _mapping(self, action: int, number: int) -> tuple[int, ...]:
+        code, argument = self.functions[number % len(self.functions)]
+        if argument is None:
+            argument = (action + number) % _ARGUMENTS.get(code, MAPPINGS)
+        return (action + number) % DOFS, code, argument, 100 * action, formats.VALUE_ONE - 500 * number
+
+
+def load(repl: RawRepl, stage: Stage) -> None:
+    """Fill the MCU's staged tables."""
+    lines = list(_lines(stage))
+    for start in range(0, len(lines), LINES_AT_ONCE):
+        repl.exec("\n".join(lines[start : start + LINES_AT_ONCE]), PATIENCE_US)
+
+
+def _lines(stage: Stage) -> Iterator[str]:
+    """Yield a stage as lines of Python for the MCU's own tables, without the commit."""
+    for name, fields, items in stage.messages():
+        values = ", ".join(str(value) for value in fields.values())
+        if name == "mappings":
+            for number, item in enumerate(items):
+                yield f"assert staged.mapping({fields['first_mapping'] + number}, *{tuple(item.values())}) is None"
+        elif name != "commit":
+            yield f"assert staged.{name}({values}{', board' if name == 'output' else ''}) is None"
+            method = {"curve": "sample", "program": "word"}.get(name)
+            for item in items:
+                yield f"assert staged.{method}({', '.join(map(str, item.values()))}) is None"
+
+
+def _message(name: str, *values: int) -> tuple[str, dict[str, int], list[dict[str, int]]]:
+    fields = messages.find(getattr(messages, name.upper()))[2]
+    return name, dict(zip([field for field, _ in fields], values, strict=True)), []
+
+
+def play(repl: RawRepl, stage: Stage) -> None:
+    """Load a stage on the MCU and play it until all weights are there."""
+    load(repl, stage)
+    repl.exec(PLAY.format(playing=PLAYING), PATIENCE_US)
