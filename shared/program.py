@@ -1,10 +1,11 @@
 """Programs: what a custom expression is compiled to, and what the MCU evaluates.
 
-A program is a straight line of signed 32-bit words for a machine with a small stack: an opcode, then its operands. There are no jumps, so it
-cannot loop. Values on the stack are Q16 and saturate at -16..16. The host compiles it; the MCU checks every word before it plays.
+A program is a straight line of signed 32-bit words for a machine with a small stack: an opcode, then its operands.
+There are no jumps, so it cannot loop. Values on the stack are Q16 and saturate at -16..16. The host compiles it; the
+MCU checks every word before it plays.
 
-Phases are given as `a * t + b`: `a` in sixteenths (-256..256), `b` as whole cycles modulo 256 and a fraction in Q24, since everything that a
-program may evaluate repeats after 256 whole cycles of its argument.
+Phases are given as `a * t + b`: `a` in sixteenths (-256..256), `b` as whole cycles modulo 256 and a fraction in Q24,
+since everything that a program may evaluate repeats after 256 whole cycles of its argument.
 """
 
 CONST = 0  # value_q16
