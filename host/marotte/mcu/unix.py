@@ -5,8 +5,8 @@
         mcu.run_for(100_000)
         print(mcu.receive())
 
-Computing takes no time here. The pins follow a model of the Pico's PWM: periods of 20 ms that begin when a pin is first
-used, and a new pulse width takes effect with the next period.
+Computing takes no time here unless `block` says so. The pins follow the model of `pwm.py`. What goes to and fro between
+this process and the board is described in `firmware/board_unix.py`.
 """
 
 from __future__ import annotations
@@ -23,18 +23,21 @@ from pathlib import Path
 from marotte.errors import MarotteError
 from marotte.images import unix_binary
 from marotte.mcu.base import VirtualMcu
+from marotte.mcu.pwm import Drive, Pins
 
 ROOT = Path(__file__).resolve().parents[3]
-PERIOD_NS = 20_000_000
 MAX_STRETCH_US = 1 << 28
 ANSWER_TIMEOUT_S = 300.0
 """Longest time for an answer: a stretch of virtual time of 268 s has 16000 frames at most."""
 
 HEAP_BYTES = 16 << 20
 STDERR_TAIL_LINES = 20
-_RECORD = struct.Struct("<cIH")
-_ARRIVAL = struct.Struct("<IH")
+_RECORD = struct.Struct("<BIH")
+_SENT, _ATTACHED, _WRITTEN, _DRIVEN, _LET_GO, _QUIET, _I2C, _RESET, _DONE = b"SAPLZQIWD"
+_ARRIVAL = struct.Struct("<IBH")
 _ARRIVAL_MAX = 0xFFFF
+_BYTES, _LEVEL, _RATIO, _DEVICE, _BLOCK = range(5)
+_UNDRIVEN = 2
 
 
 class UnixMcu(VirtualMcu):
@@ -42,30 +45,109 @@ class UnixMcu(VirtualMcu):
 
     Its words have 64 or 32 `bits`; `binary` names another `micropython` than the one that is built for them.
     `folder` is its working directory, which stands in for the flash; default is an empty one that goes with the MCU.
+    `program` is a script to run instead of the firmware's `unix_main.py`, with the same arguments.
     Raises MarotteError if there is no binary, and later if the firmware fails.
     """
 
-    def __init__(self, bits: int = 64, binary: Path | None = None, folder: Path | None = None):
+    def __init__(
+        self, bits: int = 64, binary: Path | None = None, folder: Path | None = None, program: Path | None = None
+    ):
         self.kind = "unix" if bits == 64 else "unix32"
         self._binary = Path(binary) if binary else unix_binary(bits)
-        self._folder = tempfile.TemporaryDirectory(prefix="marotte-") if folder is None else None
+        self._program = [str(program)] if program else ["-m", "firmware.unix_main"]
+        self._flash = tempfile.TemporaryDirectory(prefix="marotte-") if folder is None else None
+        self._folder = str(folder) if self._flash is None else self._flash.name
+        self._ram = tempfile.TemporaryDirectory(prefix="marotte-")
         self._now_us = 0
-        self._waiting: list[tuple[int, bytes]] = []
+        self._resets = 0
+        self._waiting: list[tuple[int, int, bytes]] = []
+        self._inputs: dict[tuple[int, bytes], bytes] = {}
         self._sent: list[tuple[int, bytes]] = []
-        self._pins: dict[int, _PwmPin] = {}
+        self._pins = Pins()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
+        self._commands = self._records = -1
+        self._process: subprocess.Popen[bytes] | None = None
+        self._start()
+
+    @property
+    def now_us(self) -> int:
+        return self._now_us
+
+    def send(self, data: bytes, at_us: int | None = None) -> None:
+        at_us = self._now_us if at_us is None else at_us
+        if at_us < self._now_us:
+            raise ValueError(f"{at_us} us has passed, it is {self._now_us} us")
+        for start in range(0, len(data), _ARRIVAL_MAX):
+            self._arrive(at_us, _BYTES, bytes(data[start : start + _ARRIVAL_MAX]))
+
+    def run_until(self, t_us: int) -> None:
+        while self._now_us < t_us:
+            self._run(min(t_us - self._now_us, MAX_STRETCH_US))
+
+    def receive(self) -> list[tuple[int, bytes]]:
+        sent, self._sent = self._sent, []
+        return sent
+
+    def edges(self, pin: int) -> list[tuple[int, int]]:
+        return self._pins.edges(pin, self._now_us)
+
+    def clear_edges(self) -> None:
+        self._pins.clear_edges(self._now_us)
+
+    def drives(self) -> dict[int, Drive]:
+        """Return what was written to each PWM pin, in `pulse_q18us`, since power on or `clear_drives`."""
+        return self._pins.drives()
+
+    def clear_drives(self) -> None:
+        """Forget what was written so far. It takes room: some 16 bytes for each output and motor tick."""
+        self._pins.clear_drives(self._now_us)
+
+    def set_pin(self, pin: int, level: int | None) -> None:
+        self._set(_LEVEL, bytes([pin]), bytes([_UNDRIVEN if level is None else level]))
+
+    def set_adc(self, pin: int, ratio: float) -> None:
+        """Set the voltage at an analogue input, as a part of the supply, from now on."""
+        self._set(_RATIO, bytes([pin]), round(ratio * 32768).to_bytes(2, "little"))
+
+    def block(self, duration_us: int) -> None:
+        """Let the main loop be busy for so long from the next instant on at which it has waited for a frame."""
+        self._arrive(self._now_us, _BLOCK, struct.pack("<I", duration_us))
+
+    def reset(self) -> None:
+        """Reset the MCU now, as its watchdog would: the firmware begins anew, what stands in flash and kept RAM stays."""
+        self._stop()
+        self._restart()
+
+    def report(self) -> dict:
+        return {
+            "kind": self.kind,
+            "now_us": self._now_us,
+            "image": str(self._binary),
+            "image_sha256": hashlib.sha256(self._binary.read_bytes()).hexdigest(),
+        }
+
+    def close(self) -> None:
+        self._stop()
+        self._errors.close()
+        self._ram.cleanup()
+        if self._flash:
+            self._flash.cleanup()
+
+    def _start(self) -> None:
+        """Start a process, and let it run up to the beginning of its time."""
         command_read, self._commands = os.pipe()
         self._records, record_write = os.pipe()
-        words = [self._binary, "-X", f"heapsize={HEAP_BYTES}", "-m", "firmware.unix_main"]
+        words = [str(self._binary), "-X", f"heapsize={HEAP_BYTES}", *self._program]
         words += [f"/dev/fd/{command_read}", f"/dev/fd/{record_write}"]
+        words += [str(Path(self._ram.name) / "kept"), str(self._resets)]
         try:
             self._process = subprocess.Popen(
-                [str(word) for word in words],
+                words,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
                 pass_fds=(command_read, record_write),
-                cwd=folder or (self._folder.name if self._folder else None),
+                cwd=self._folder,
                 env={**os.environ, "MICROPYPATH": str(ROOT)},
                 start_new_session=True,  # Ctrl-C is for us: we still have a puppet to stop
             )
@@ -77,111 +159,100 @@ class UnixMcu(VirtualMcu):
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
         self._buffer = b""
-        self._read_records()
+        self._read_records(self._now_us)
 
-    @property
-    def now_us(self) -> int:
-        return self._now_us
-
-    def send(self, data: bytes, at_us: int | None = None) -> None:
-        at_us = self._now_us if at_us is None else at_us
-        if at_us < self._now_us:
-            raise ValueError(f"{at_us} us has passed, it is {self._now_us} us")
-        place = len(self._waiting)
-        while place and self._waiting[place - 1][0] > at_us:
-            place -= 1
-        self._waiting.insert(place, (at_us, bytes(data)))
-
-    def run_until(self, t_us: int) -> None:
-        while self._now_us < t_us:
-            self._run(min(t_us - self._now_us, MAX_STRETCH_US))
-
-    def receive(self) -> list[tuple[int, bytes]]:
-        sent, self._sent = self._sent, []
-        return sent
-
-    def edges(self, pin: int) -> list[tuple[int, int]]:
-        model = self._pins.get(pin)
-        return model.edges_until(self._now_us * 1000) if model else []
-
-    def clear_edges(self) -> None:
-        for model in self._pins.values():
-            model.edges_until(self._now_us * 1000).clear()
-
-    def set_pin(self, pin: int, level: int | None) -> None:
-        """Inputs are not modelled on the PC: the firmware has none yet that works without an RP2040."""
-        raise MarotteError(f"pin {pin}: the PC's emulated MCU has no inputs; use rp2040")
-
-    def report(self) -> dict:
-        return {
-            "kind": self.kind,
-            "now_us": self._now_us,
-            "image": str(self._binary),
-            "image_sha256": hashlib.sha256(self._binary.read_bytes()).hexdigest(),
-        }
-
-    def close(self) -> None:
-        if self._process.poll() is None:
+    def _stop(self) -> None:
+        """End the process; doing it twice does no harm."""
+        if self._process:
             self._process.kill()
-        self._process.wait()
-        if self._process.stdout:
-            self._process.stdout.close()
+            self._process.wait()
+            if self._process.stdout:
+                self._process.stdout.close()
+        self._process = None
         for descriptor in (self._commands, self._records):
             with contextlib.suppress(OSError):
                 os.close(descriptor)
         self._commands = self._records = -1
-        self._errors.close()
-        if self._folder:
-            self._folder.cleanup()
+
+    def _restart(self) -> None:
+        """Start the firmware anew; the world around it stays."""
+        self._resets += 1
+        self._pins.reset(self._now_us)
+        self._waiting[:0] = [(self._now_us, kind, which + value) for (kind, which), value in self._inputs.items()]
+        self._start()
+
+    def _set(self, kind: int, which: bytes, value: bytes) -> None:
+        """Set an input, which a reset of the MCU leaves as it is."""
+        self._inputs[kind, which] = value
+        self._arrive(self._now_us, kind, which + value)
+
+    def _arrive(self, at_us: int, kind: int, data: bytes) -> None:
+        place = len(self._waiting)
+        while place and self._waiting[place - 1][0] > at_us:
+            place -= 1
+        self._waiting.insert(place, (at_us, kind, data))
 
     def _run(self, length_us: int) -> None:
-        end_us = self._now_us + length_us
-        arrivals = []
-        while self._waiting and self._waiting[0][0] <= end_us:
-            at_us, data = self._waiting.pop(0)
-            for start in range(0, len(data), _ARRIVAL_MAX):
-                part = data[start : start + _ARRIVAL_MAX]
-                arrivals.append(_ARRIVAL.pack(at_us - self._now_us, len(part)) + part)
-        body = b"".join(arrivals)
+        start_us = self._now_us
+        end_us = start_us + length_us
+        taken = 0
+        while taken < len(self._waiting) and self._waiting[taken][0] <= end_us:
+            taken += 1
+        arrivals = self._waiting[:taken]
+        del self._waiting[:taken]
+        body = b"".join(_ARRIVAL.pack(at_us - start_us, kind, len(data)) + data for at_us, kind, data in arrivals)
         try:
             _write_all(self._commands, struct.pack("<II", length_us, len(body)) + body)
         except OSError:
             raise self._failed("it has ended") from None
-        self._read_records()
-        self._now_us = end_us
+        self._now_us = self._read_records(start_us)
+        if self._now_us < end_us or self._process is None:
+            self._waiting[:0] = [arrival for arrival in arrivals if arrival[0] >= self._now_us]
+            self._restart()
 
-    def _read_records(self) -> None:
-        """Read records up to the end of the stretch, and what was printed in it."""
+    def _read_records(self, start_us: int) -> int:
+        """Read records of a stretch up to its end, or to a reset, and what was printed in it; return when that was.
+
+        After a reset there is no process.
+        """
+        place = 0
         while True:
-            while len(self._buffer) >= _RECORD.size:
-                kind, offset_us, count = _RECORD.unpack_from(self._buffer)
-                end = _RECORD.size + count
-                if len(self._buffer) < end:
+            buffer = self._buffer
+            while len(buffer) - place >= _RECORD.size:
+                kind, offset_us, count = _RECORD.unpack_from(buffer, place)
+                data_at = place + _RECORD.size
+                if len(buffer) - data_at < count:
                     break
-                data, self._buffer = self._buffer[_RECORD.size : end], self._buffer[end:]
-                if kind == b"D":
-                    self._read_printed(self._now_us + offset_us)
-                    return
-                self._take(kind, self._now_us + offset_us, data)
-            self._buffer += self._read_some()
+                place = data_at + count
+                at_us = start_us + offset_us
+                if kind == _WRITTEN:
+                    self._pins.write(at_us, buffer, data_at, place)
+                elif kind == _DONE or kind == _RESET:
+                    self._buffer = buffer[place:]
+                    self._read_printed(at_us)
+                    if kind == _RESET:
+                        self._stop()
+                    return at_us
+                else:
+                    self._take(kind, at_us, buffer[data_at:place])
+            self._buffer = buffer[place:] + self._read_some()
+            place = 0
 
-    def _take(self, kind: bytes, at_us: int, data: bytes) -> None:
-        if kind == b"S":
+    def _take(self, kind: int, at_us: int, data: bytes) -> None:
+        if kind == _SENT:
             self._read_printed(at_us)
             self._sent.append((at_us, data))
-        elif kind == b"Q":
-            for model in self._pins.values():
-                model.quiet(at_us * 1000)
-        elif kind == b"R":
-            if data[0] in self._pins:
-                self._pins[data[0]].quiet(at_us * 1000)
-        else:
-            for pin, pulse_q4us in struct.iter_unpack("<BH", data):
-                model = self._pins.setdefault(pin, _PwmPin(at_us * 1000))
-                model.pulse(at_us * 1000, pulse_q4us * 1000 // 16)
+        elif kind == _ATTACHED:
+            self._pins.attach(at_us, *struct.unpack("<BII", data))
+        elif kind == _DRIVEN:
+            self._pins.drive(at_us, data[0], data[1])
+        elif kind == _LET_GO:
+            self._pins.drive(at_us, data[0], 0)
+        elif kind == _QUIET:
+            self._pins.quiet(at_us)
 
     def _read_printed(self, at_us: int) -> None:
-        assert self._process.stdout is not None
+        assert self._process and self._process.stdout
         printed = self._process.stdout.read()
         if printed:
             self._sent.append((at_us, printed))
@@ -196,49 +267,12 @@ class UnixMcu(VirtualMcu):
         return data
 
     def _failed(self, what: str) -> MarotteError:
-        self._process.kill()
-        self._process.wait()
+        self._stop()
         self._errors.seek(0)
         tail = self._errors.read().decode(errors="replace").splitlines()[-STDERR_TAIL_LINES:]
         return MarotteError(
             "\n".join([f"the firmware on {self._binary} failed: {what}", *(f"    {line}" for line in tail)])
         )
-
-
-class _PwmPin:
-    """One PWM output: the level's changes, worked out period by period."""
-
-    def __init__(self, start_ns: int):
-        self._next_ns = start_ns + PERIOD_NS
-        self._width_ns = 0
-        self._fall_ns = -1  # when the pulse under way ends, -1 if the level is low
-        self._edges: list[tuple[int, int]] = []
-
-    def pulse(self, at_ns: int, width_ns: int) -> None:
-        """Set the width of the pulses from the next period on."""
-        self.edges_until(at_ns)
-        self._width_ns = width_ns
-
-    def quiet(self, at_ns: int) -> None:
-        """Drive the pin low, now and from now on."""
-        self.edges_until(at_ns)
-        self._width_ns = 0
-        if self._fall_ns >= 0:
-            self._edges.append((at_ns, 0))
-            self._fall_ns = -1
-
-    def edges_until(self, end_ns: int) -> list[tuple[int, int]]:
-        """Let time pass; return the list of all edges that are remembered."""
-        while True:
-            if 0 <= self._fall_ns <= end_ns:
-                self._edges.append((self._fall_ns, 0))
-                self._fall_ns = -1
-            if self._next_ns > end_ns:
-                return self._edges
-            if self._width_ns:
-                self._edges.append((self._next_ns, 1))
-                self._fall_ns = self._next_ns + self._width_ns
-            self._next_ns += PERIOD_NS
 
 
 def _write_all(descriptor: int, data: bytes) -> None:
