@@ -272,9 +272,10 @@ MISMATCH = 2  # hello: protocol or dictionary differ; the welcome that follows t
 UNKNOWN = 3  # no such message; detail: its id
 LENGTH = 4  # the payload has not the length of its message; detail: the length found
 RANGE = 5  # a field is out of its range; detail: which field, counted from 0 (items go on after the fields)
-INCOMPLETE = 6  # commit without all that begin announced; detail: how many parts are missing
-STATE = 7  # not possible now (tables while the motion runs, start without tables, arm without outputs)
+INCOMPLETE = 6  # commit or save_end without all that was announced; detail: how many parts or bytes are missing
+STATE = 7  # not possible now (start without tables, arm without outputs, save while armed or while the motion runs)
 FULL = 8  # the queue of stamped targets is full; detail: its free places
+FLASH = 9  # the flash could not be read or written; detail: the number of the error, as in errno
 
 STATUS_TEXT = (
     "done",
@@ -286,6 +287,7 @@ STATUS_TEXT = (
     "tables are incomplete",
     "not possible in this state",
     "the queue of stamped targets is full",
+    "the flash could not be read or written",
 )
 
 _SIZES = {"B": 1, "H": 2, "I": 4, "i": 4}
