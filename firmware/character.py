@@ -108,6 +108,11 @@ class Character:
         self.output_q24[dof] = self._before_q24[dof] = position_q24 + _ZERO
         self._rate_q24[dof] = _ZERO
 
+    def rearrange(self, gather_words, keep, scratch, dofs):
+        """Let other tables have other DOFs."""
+        for values in (self.output_q24, self._before_q24, self._rate_q24):
+            gather_words(values, keep, scratch, dofs, _ZERO, 0)
+
     def load(self, tables):
         """Take over which DOFs have a character, and its coefficients."""
         for d in range(tables.dofs):

@@ -37,8 +37,8 @@ def limit(
 ):
     """Move every DOF by one tick towards what is wanted, within its limits.
 
-    `wanted`, `correction` and `velocity` (per tick) are Q24 with 16 added. `reference` is what was wanted in the last tick, within
-    the range. A DOF that is `held` stands still. `standing` not 0 lets relative DOFs come to a stand, by at most
+    `wanted`, `correction`, `reference` and `velocity` (per tick) are Q24 with 16 added. `reference` is what was wanted in the last
+    tick, within the range; this one's is written there. A DOF that is `held` stands still. `standing` not 0 lets relative DOFs come to a stand, by at most
     `calm_q24` a tick. Limits: `low <= high` within 0..2^24, speed 1..2^24, accel 2..2^24.
     Bits: positions have 25, distances 26, `2 x / A` 26; `n (n + 1)` stays below 2^27, `A (n - 1)` below 2^26.
     """
@@ -54,9 +54,7 @@ def limit(
         if target < low:
             target = low
         v = 0
-        if held[d]:
-            target = p
-        elif relative[d]:
+        if relative[d] and held[d] == 0:
             if standing:
                 target = _STILL
                 if accel > calm_q24:
@@ -66,11 +64,12 @@ def limit(
                 v = accel
             if v < -accel:
                 v = -accel
-        else:
+        elif held[d] == 0:
             speed = speed_q24[d]
             before = velocity_q24[d] - _ZERO
-            moves = target - reference_q24[d]
-            way = reference_q24[d] - p
+            last = reference_q24[d] - _ZERO
+            moves = target - last
+            way = last - p
             # Twice: the velocity that catches up with the reference, then the greatest that stays in the range.
             turn = 0
             while turn < 2:
@@ -114,5 +113,5 @@ def limit(
                 turn += 1
         position_q24[d] = p + v
         velocity_q24[d] = v + _ZERO
-        reference_q24[d] = target
+        reference_q24[d] = target + _ZERO
         d += 1

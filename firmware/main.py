@@ -6,29 +6,38 @@ leaves the board safe: no pulses, nothing moving.
 
 import gc
 
+from firmware import store
+from firmware.clock import ticks_diff
 from firmware.link import Link
 from firmware.puppet import Puppet
+from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
+_WATCHDOG_MS = 1000  # a main loop or motor ticks that stand still for so long reset the board
 
 
 def perform(board):
     """Run a puppet on a board. All that it needs is allocated before the loop begins."""
     puppet = Puppet(board)
+    motor = puppet.motor
     link = Link(board, puppet)
-    gc.collect()
     try:
+        store.load(link.commands)
+        gc.collect()
+        board.watchdog(_WATCHDOG_MS)
         while not link.poll():
-            longest_us = _IDLE_US
+            motor.attend()
+            longest_us = min(_IDLE_US, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
             if puppet.frame >= 0:
-                longest_us = puppet.clock.until_us(board.ticks_us())
-                if longest_us <= 0:
-                    puppet.step(link.silent)
+                due_us = puppet.clock.until_us(board.ticks_us())
+                if due_us <= 0:
+                    puppet.step()
                     link.report()
                     continue
                 if puppet.prepare():
                     continue
+                longest_us = min(longest_us, due_us)
             board.wait(longest_us)
     finally:
-        puppet.motor.kill()
+        motor.kill(KILLED_BY_HOST)
         board.close()

@@ -1,133 +1,462 @@
-"""Motor control: the last layer before the board. Clamps, calibrates, and decides whether pulses flow.
+"""Motor control: from the frames' targets to what the outputs get, at the motor layer's own rate.
 
-Absolute DOFs take positions, relative DOFs velocities with 16384 (Q15) standing still. Nothing is driven until `arm`;
-`kill` takes all pulses away at once. When the link falls silent, relative DOFs ease to a stand within 300 ms.
+`tick` runs in interrupt context, from a hardware timer, whatever the main loop does: it looks at the kill pin, counts
+the silence of the link, and takes every DOF one step further (trajectory, character, error correction, limits,
+calibration), then lets the drivers write. It is safe there because it allocates nothing, waits for nothing, and shares with the
+main loop only words that one side writes: the main loop stores a frame in a ring and then its number (`put`), the tick
+stores positions. Where the main loop changes what the tick uses (attaching, letting go, other tables) it holds interrupts
+off for a few hundred microseconds (`board.lock`). A late synthesis makes the tick go on with guesses, never wait.
+
+Nothing is driven until `arm`; then the guards attach one DOF after the other, each from its last known pose. `kill` takes all
+pulses away at once.
 """
 
 import micropython
 from micropython import const
 
-from firmware.tables import halves
-from shared.formats import DOFS_MAX, NO_PIN, VALUE_ONE
+from firmware import calibration, limiter
+from firmware.character import Character
+from firmware.clock import TICKS_MASK, ticks_diff
+from firmware.feedback import Feedback
+from firmware.guards import Guards
+from firmware.tables import halves, words
+from firmware.trajectory import ZERO_Q24, Ring, Trajectory
+from shared.formats import (
+    DOFS_MAX,
+    KILLED_BY_NOBODY,
+    KILLED_BY_PIN,
+    KILLED_BY_STOPPED_TICKS,
+    MOTOR_PERIOD_MAX_US,
+    NO_DRIVER,
+    NO_PIN,
+    POSITION_ONE,
+    SILENT_IDLE,
+    SILENT_RELAX,
+)
 
-_STOP_MS = const(300)
-_ONE_Q15 = const(32768)
+_DOFS = const(16)
+_MICRO = const(1000000)
+_STILL_Q24 = const(0x800000)
+_CALM_PER_S = const(4)  # change of a wheel's speed when it has to stand: from full speed in 250 ms
+_GLIDE_US_PER_S = const(200)  # of pulse ends that are set anew
+_AHEAD_US = const(2000)  # a start that is nearer to the next tick takes the one after it
+_STOPPED_US = const(100000)  # without a tick for so long, the main loop takes the pulses away
+_KEEP_US = const(16000)  # between two notes of the pose
 
 
 @micropython.viper
-def _move(
-    dofs: int,
-    signal_q15: ptr16,
-    relative: ptr8,
-    ease_q15: int,
-    low_q15: ptr16,
-    high_q15: ptr16,
-    motor_q15: ptr16,
-    pulse0_q4us: ptr16,
-    pulse1_q4us: ptr16,
-    pulse_q4us: ptr16,
-):
-    """Write the clamped value and the calibrated pulse width of every DOF.
-
-    `ease_q15` scales the speed of relative DOFs, 32768 being full. Bits: values are Q15 in 0..32768, pulse widths below
-    2^16, so products stay within 2^31.
-    """
+def _remember(position_q24: ptr32, before_q24: ptr32, dofs: int):
+    """Shift the positions of the last two ticks."""
     d = 0
     while d < dofs:
-        value = int(signal_q15[d])
-        if relative[d]:
-            value = 16384 + (((value - 16384) * ease_q15 + 0x4000) >> 15)
-        if value > high_q15[d]:
-            value = int(high_q15[d])
-        if value < low_q15[d]:
-            value = int(low_q15[d])
-        motor_q15[d] = value
-        at_0 = int(pulse0_q4us[d])
-        pulse_q4us[d] = at_0 + (((int(pulse1_q4us[d]) - at_0) * value + 0x4000) >> 15)
+        before_q24[_DOFS + d] = before_q24[d]
+        before_q24[d] = position_q24[d]
         d += 1
 
 
 class Motor:
-    """The outputs of one puppet.
+    """The motor layer of one puppet on one board.
 
-    `motor_q15` is what each DOF was last told, `pulse_q4us` its pulse width in 1/16 us.
+    `tick` is the handler of the board's motor ticks. Per DOF: `position_q24` is where the layer has led it, `velocity_q24` what it
+    moved in the last tick, `reference_q24` where it would like to be (both with `ZERO_Q24` added). `attached` has the bit of every
+    DOF that has pulses. `tap_ring` holds the course at the instants of the last 16 frames, `tapped[0]` is the last of them.
+    `silent` tells that no packet has come for the puppet's `link_timeout`.
     """
 
-    def __init__(self, board, tables):
+    def __init__(self, board, drivers, tables):
         self.armed = False
-        self.motor_q15 = halves(DOFS_MAX)
-        self.pulse_q4us = halves(DOFS_MAX)
+        self.attached = 0
+        self.killed_by = KILLED_BY_NOBODY
+        self.silent = True
+        self.playing = False
+        self.ticks = 0
+        self.tick_max_us = 0
+        self.tick_late_max_us = 0
+        self.tables = tables
+        self.position_q24 = words(DOFS_MAX)
+        self.velocity_q24 = words(DOFS_MAX)
+        self.reference_q24 = words(DOFS_MAX)
+        self.tap_ring = Ring()
+        self.tap_q15 = self.tap_ring.value_q15
+        self.tapped = words(1)
+        self.slope_q16 = words(DOFS_MAX)
+        self.bend_q15 = words(DOFS_MAX)
+        self.feedback = Feedback(board)
+        self.trajectory = Trajectory()
+        self.guards = Guards(self, board)
         self._board = board
-        self._ease_q15 = VALUE_ONE
-        self._tables = tables
+        self._drivers = drivers
+        self._character = Character()
+        self._correction_q24 = words(DOFS_MAX)
+        self._before_q24 = words(2 * DOFS_MAX)
+        self._level_q24 = words(DOFS_MAX)
+        self._pulse_q18us = words(DOFS_MAX)
+        self._end_q4us = halves(2 * DOFS_MAX)
+        self._held = bytearray(DOFS_MAX)
+        self._turn = bytearray(DOFS_MAX)
+        self._rest_q15 = None
+        self._period_us = 0
+        self._step = 0
+        self._calm_q24 = 0
+        self._glide_q4us = 0
+        self._timeout_ticks = 0
+        self._quiet_ticks = 0
+        self._keep_ticks = 0
+        self._keep_wait = 0
+        self._starting = 0
+        self._tap_part = 0
+        self._later = 0
+        self._expected_us = -1
+        self._since = 0  # ticks at which the turns began
+        self._seen = 0
+        self._seen_us = board.ticks_us()
+        self.tick = self._tick  # bound once: binding allocates
+        self._set_rates(tables)
+        board.start_ticks(MOTOR_PERIOD_MAX_US, self.tick)
+
+    # --- the main loop's side
+
+    @property
+    def late_frames(self):
+        """Return how many frames were not there when they should have taken effect, since `start`."""
+        return self.trajectory.late
+
+    @property
+    def released(self):
+        """Return a mask of the armed DOFs that a guard has taken the pulses from."""
+        return self.guards.released
+
+    @property
+    def stalled(self):
+        """Return a mask of the DOFs that were let go because they could not move."""
+        return self.guards.stalled
 
     def load(self, tables):
-        """Take over a puppet's limits and calibration; all outputs fall silent, every DOF is at rest."""
-        self.kill()
-        self._tables = tables
-        self._ease_q15 = VALUE_ONE
-        self._write(tables.rest_q15)
-
-    def exchange(self, tables):
-        """Take over other tables while the motion goes on. Pins that are no longer used fall silent; new ones wait for `arm`."""
-        before = self._tables
-        for d in range(before.dofs):
-            pin = before.pin[d]
-            if pin != NO_PIN and not self._drives(tables, pin):
-                self._board.release(pin)
-        self._tables = tables
-
-    def _drives(self, tables, pin):
+        """Take over a puppet's tables while nothing moves: all outputs fall silent, each DOF is at its last known pose."""
+        self.kill(self.killed_by)
+        state = self._board.lock()
+        self.playing = False
+        self._starting = 0
+        self.tables = tables
         for d in range(tables.dofs):
-            if tables.pin[d] == pin:
-                return True
-        return False
+            self.position_q24[d] = tables.rest_q15[d] << 9
+        self._board.kept_pose(tables.dofs, self.position_q24, _tag(tables))
+        for d in range(tables.dofs):
+            if tables.driver[d] == NO_DRIVER:
+                self.position_q24[d] = tables.rest_q15[d] << 9
+            elif tables.relative[d]:
+                self.position_q24[d] = _STILL_Q24
+            self._turn[d] = 0
+            self._end_q4us[d] = tables.end0_q4us[d]
+            self._end_q4us[_DOFS + d] = tables.end1_q4us[d]
+            self._stand(d)
+        self._hold_unattached()
+        self._drivers.load(tables)
+        self._take_over(tables)
+        self._set_rates(tables)
+        self.trajectory.hold(tables.dofs, self.position_q24)
+        self._since = self.ticks
+        self._board.start_ticks(tables.motor_period_us, self.tick)
+        self._expected_us = -1
+        self._board.unlock(state)
 
-    def begin(self):
-        """Let relative DOFs have their full speed from the first frame on, however the motion ended before."""
-        self._ease_q15 = VALUE_ONE
+    def exchange(self, tables, gather_words, gather_halves, scratch):
+        """Take over other tables while the motion goes on; `tables.keep_dof` says which DOF was which.
 
-    def move(self, signal_q15, silent):
-        """Bring one frame's values to the outputs; `silent` tells that the link has been quiet too long."""
-        if silent or self._ease_q15 != _ONE_Q15:
-            self._ease(silent)
-        self._write(signal_q15)
+        Outputs that are no longer used fall silent, new ones are attached one after the other. Frame rate and motor period are
+        the same. `gather_*(values, old, scratch, count, fresh)` rearrange an array.
+        """
+        state = self._board.lock()
+        before = self.tables
+        keep = tables.keep_dof
+        dofs = tables.dofs
+        attached = 0
+        going_on = self._drivers.load(tables)
+        for d in range(dofs):
+            was = keep[d]
+            if was < before.dofs and self.attached >> was & 1 and _same_output(tables, d, before, was):
+                attached |= going_on & 1 << d
+            if (going_on & ~attached) >> d & 1:  # another DOF's output: the new one begins from its own pose
+                self._drivers.release(d)
+        for values, fresh in self._state():
+            gather_words(values, keep, scratch, dofs, fresh, 0)
+        self.trajectory.rearrange(gather_words, gather_halves, keep, scratch, dofs)
+        self._character.rearrange(gather_words, keep, scratch, dofs)
+        for place in range(2):
+            gather_words(self._before_q24, keep, scratch, dofs, 0, place * _DOFS)
+            gather_halves(self._end_q4us, keep, scratch, dofs, 0, place * _DOFS)
+        self.tap_ring.rearrange(gather_halves, keep, scratch, dofs, self.trajectory.newest)
+        self.tables = tables
+        for d in range(dofs):
+            self._turn[d] = ((self.ticks - self._since) & TICKS_MASK) % tables.turns[d]
+            if keep[d] >= before.dofs:
+                self.position_q24[d] = tables.rest_q15[d] << 9
+                self._stand(d)
+                self.trajectory.stand_one(d, self.position_q24[d])
+                self._end_q4us[d] = tables.end0_q4us[d]
+                self._end_q4us[_DOFS + d] = tables.end1_q4us[d]
+            elif not _same_output(tables, d, before, keep[d]):
+                self._end_q4us[d] = tables.end0_q4us[d]
+                self._end_q4us[_DOFS + d] = tables.end1_q4us[d]
+        self.attached = attached
+        self._hold_unattached()
+        self._take_over(tables)
+        self._board.unlock(state)
+
+    def start(self):
+        """Begin the motion: return the instant of frame 0, which is that of a motor tick soon."""
+        board = self._board
+        state = board.lock()
+        due_us = board.tick_due_us()
+        self._starting = 1
+        if ticks_diff(due_us, board.ticks_us()) < _AHEAD_US:
+            due_us = (due_us + self._period_us) & TICKS_MASK
+            self._starting = 2
+        self.trajectory.prepare()
+        self.tick_max_us = self.tick_late_max_us = 0
+        board.unlock(state)
+        return due_us
 
     def stand(self):
-        """Stop relative DOFs where no frames follow; absolute DOFs keep their position."""
-        self._ease_q15 = 0
-        self._write(self.motor_q15)
+        """Come to a stand: relative DOFs slow down, absolute DOFs settle where the last frame wanted them."""
+        self.playing = False
+        self._starting = 0
+
+    def put(self, frame, signal_q15):
+        """Hand a frame's targets to the ticks."""
+        self.trajectory.put(frame, self.tables.dofs, signal_q15)
+
+    def heard(self):
+        """Note that a packet has come."""
+        self._quiet_ticks = 0
+        self.silent = False
 
     def arm(self):
-        """Let pulses flow, from the present values. Returns whether there is an output to arm."""
-        tables = self._tables
+        """Let pulses flow, one DOF after the other. Returns whether there is an output, and no pin that kills."""
+        tables = self.tables
+        if tables.kill_pin != NO_PIN and self._board.level(tables.kill_pin) == tables.kill_level:
+            return False
         for d in range(tables.dofs):
-            if tables.pin[d] != NO_PIN:
-                self._board.attach(tables.pin[d])
+            if tables.driver[d] != NO_DRIVER:
                 self.armed = True
-        if self.armed:
-            self._board.pulses(tables.dofs, tables.pin, self.pulse_q4us)
-        return self.armed
+                self.killed_by = KILLED_BY_NOBODY
+                return self.guards.arm(self._board.ticks_us())
+        return False
 
-    def kill(self):
-        """Take away all pulses, now."""
+    def kill(self, killed_by):
+        """Take away all pulses, now. Called from the tick as well."""
+        state = self._board.lock()
         self.armed = False
-        self._board.quiet()
+        self.attached = 0
+        self.killed_by = killed_by
+        self._drivers.quiet()
+        self.guards.disarm()
+        self._hold_unattached()
+        self._board.unlock(state)
 
-    def _ease(self, silent):
-        step_q15 = 1 + _ONE_Q15 * 1000 // (_STOP_MS * self._tables.frame_rate_hz)
-        if silent:
-            self._ease_q15 = max(0, self._ease_q15 - step_q15)
-        else:
-            self._ease_q15 = min(_ONE_Q15, self._ease_q15 + step_q15)
+    def calibrate(self, dof, end0_q4us, end1_q4us, dead_q15, top_q15):
+        """Set a DOF's calibration, which has been checked; pulses glide there."""
+        self.tables.calibrate(dof, end0_q4us, end1_q4us, dead_q15, top_q15)
 
-    def _write(self, signal_q15):
-        tables = self._tables
-        # fmt: off
-        _move(
-            tables.dofs, signal_q15, tables.relative, self._ease_q15, tables.limit_low_q15, tables.limit_high_q15,
-            self.motor_q15, tables.pulse0_q4us, tables.pulse1_q4us, self.pulse_q4us,
-        )
-        # fmt: on
+    def limit(self, dof, low_q15, high_q15, speed_q24, accel_q24):
+        """Set a DOF's limits, which have been checked; a DOF that is beyond them brakes and comes back."""
+        state = self._board.lock()
+        self.tables.limit(dof, low_q15, high_q15, speed_q24, accel_q24)
+        self._board.unlock(state)
+
+    def attach(self, dof):
+        """Let a DOF have pulses again, from where it was last, or is measured to be."""
+        board = self._board
+        state = board.lock()
         if self.armed:
-            self._board.pulses(tables.dofs, tables.pin, self.pulse_q4us)
+            tables = self.tables
+            start_q24 = self.feedback.start(dof)
+            if start_q24 >= 0:
+                self.position_q24[dof] = start_q24
+            self._stand(dof)
+            self.trajectory.stand_one(dof, self.position_q24[dof])
+            self._held[dof] = 0
+            self.attached |= 1 << dof
+            ticks = tables.turns[dof] - 1 - self._turn[dof]
+            until_us = ticks_diff(board.tick_due_us(), board.ticks_us()) + ticks * self._period_us
+            self._drivers.attach(dof, until_us)
+        board.unlock(state)
+
+    def detach(self, dof):
+        """Take the pulses of one DOF away; it counts as standing where it is."""
+        state = self._board.lock()
+        self.attached &= ~(1 << dof)
+        if self.tables.relative[dof]:
+            self.position_q24[dof] = _STILL_Q24
+        self._held[dof] = 1
+        self._drivers.release(dof)
+        self._board.unlock(state)
+
+    def derive(self):
+        """Bring `slope_q16` and `bend_q15`, the derivatives of the targets by frames, up to date."""
+        state = self._board.lock()
+        self.trajectory.derive(self.tables.dofs, self.slope_q16, self.bend_q15)
+        self._board.unlock(state)
+
+    def attend(self):
+        """Do what the main loop has to do for the motors: slow drivers, guards, the watchdog. Called at each pass."""
+        board = self._board
+        now_us = board.ticks_us()
+        if self.ticks == self._seen:
+            if self.armed and ticks_diff(now_us, self._seen_us) > _STOPPED_US:
+                self.kill(KILLED_BY_STOPPED_TICKS)
+            return
+        self._seen = self.ticks
+        self._seen_us = now_us
+        board.feed()
+        state = board.lock()
+        due = self._later
+        self._later = 0
+        board.unlock(state)
+        self._drivers.flush(self._level_q24, self._pulse_q18us, due)
+        self._drivers.attend(now_us)
+        self.guards.attend(now_us, self.silent and self.tables.when_silent == SILENT_RELAX)
+
+    # --- the tick
+
+    def _tick(self):
+        board = self._board
+        begun_us = board.ticks_us()
+        tables = self.tables
+        dofs = tables.dofs
+        self.ticks = (self.ticks + 1) & TICKS_MASK
+        if tables.kill_pin != NO_PIN and self.armed and board.level(tables.kill_pin) == tables.kill_level:
+            self.kill(KILLED_BY_PIN)
+        if self._quiet_ticks >= self._timeout_ticks:
+            self.silent = True
+        else:
+            self._quiet_ticks += 1
+        if self._starting:
+            self._starting -= 1
+            if self._starting == 0:
+                self.trajectory.start(dofs, self.position_q24)
+                self.playing = True
+                self.tapped[0] = -1
+                self._tap_part = -self._step - self._step // 2
+        resting = self.silent and tables.when_silent != SILENT_IDLE
+        self.trajectory.advance(dofs, self.playing, tables.rest_q15 if resting else None)
+        self._character.respond(dofs, self.trajectory.reference_q24)
+        self.feedback.tick(self.attached, self.position_q24, self._correction_q24)
+        # fmt: off
+        limiter.limit(
+            self._character.output_q24, self._correction_q24, self.reference_q24, self.position_q24, self.velocity_q24,
+            dofs, self._held, tables.relative, tables.limit_low_q24, tables.limit_high_q24, tables.speed_q24,
+            tables.accel_q24, self.silent or not self.playing, self._calm_q24,
+        )
+        if self.playing:
+            self._tap(dofs)
+        _remember(self.position_q24, self._before_q24, dofs)
+        due = calibration.calibrate(
+            self.position_q24, self._level_q24, self._pulse_q18us, dofs, tables.relative, self._end_q4us,
+            tables.end0_q4us, tables.end1_q4us, self._glide_q4us, tables.dead_q15, tables.top_q15, self._turn,
+            tables.turns,
+        ) & self.attached
+        # fmt: on
+        if due:
+            self._drivers.write(self._level_q24, self._pulse_q18us, due)
+            self._later |= due
+        self._keep_wait -= 1
+        if self._keep_wait <= 0:
+            self._keep_wait = self._keep_ticks
+            board.keep_pose(dofs, self.position_q24)
+        self._measure(begun_us)
+
+    def _tap(self, dofs):
+        """Note the course at the instants of frames that lie half a tick or more behind."""
+        part = self._tap_part + self._step
+        while part >= 0:
+            frame = self.tapped[0] + 1
+            # z = 1 - part / step in Q15, in two steps that stay small
+            scaled = part << 9
+            whole = scaled // self._step
+            z_q15 = 32768 - (whole << 6) - (((scaled - whole * self._step) << 6) // self._step)
+            calibration.tap(
+                self.position_q24, self._before_q24, dofs, z_q15, self.tap_ring.value_q15, (frame & 15) * _DOFS
+            )
+            self.tapped[0] = frame
+            part -= _MICRO
+        self._tap_part = part
+
+    def _measure(self, begun_us):
+        """Keep the longest tick, and the largest lateness of one against the first."""
+        if self._expected_us < 0:
+            self._expected_us = begun_us
+        late_us = ticks_diff(begun_us, self._expected_us)
+        if late_us > self.tick_late_max_us:
+            self.tick_late_max_us = late_us
+        self._expected_us = (self._expected_us + self._period_us) & TICKS_MASK
+        took_us = ticks_diff(self._board.ticks_us(), begun_us)
+        if took_us > self.tick_max_us:
+            self.tick_max_us = took_us
+
+    # --- shared
+
+    def _stand(self, dof):
+        """Let a DOF stand where it is; the trajectory is seen to by the caller."""
+        position_q24 = self.position_q24[dof]
+        self.velocity_q24[dof] = ZERO_Q24
+        self.reference_q24[dof] = position_q24 + ZERO_Q24
+        self._before_q24[dof] = self._before_q24[_DOFS + dof] = position_q24
+        self._correction_q24[dof] = ZERO_Q24
+        self._character.stand(dof, position_q24)
+
+    def _hold_unattached(self):
+        """Hold every DOF with an output that has no pulses; a wheel without pulses stands."""
+        tables = self.tables
+        for d in range(tables.dofs):
+            if tables.driver[d] == NO_DRIVER or self.attached >> d & 1:
+                self._held[d] = 0
+            else:
+                self._held[d] = 1
+                if tables.relative[d]:
+                    self.position_q24[d] = _STILL_Q24
+
+    def _take_over(self, tables):
+        self.trajectory.load(tables)
+        self._character.load(tables)
+        self.feedback.load(tables)
+        self.guards.load()
+        if tables.kill_pin != NO_PIN:
+            self._board.input_pullup(tables.kill_pin)
+        self._timeout_ticks = tables.link_timeout_ms * 1000 // tables.motor_period_us
+
+    def _set_rates(self, tables):
+        period_us = tables.motor_period_us
+        self._period_us = period_us
+        self._step = period_us * tables.frame_rate_hz
+        self._calm_q24 = _CALM_PER_S * (POSITION_ONE // 2) * period_us // _MICRO
+        self._glide_q4us = max(1, _GLIDE_US_PER_S * 16 * period_us // _MICRO)
+        self._keep_ticks = _KEEP_US // period_us
+
+    def _state(self):
+        return (
+            (self.position_q24, 0),
+            (self.velocity_q24, ZERO_Q24),
+            (self.reference_q24, ZERO_Q24),
+            (self._correction_q24, ZERO_Q24),
+        )
+
+
+def _same_output(tables, dof, other, was):
+    """Return whether a DOF has the very output that another had in other tables."""
+    if tables.driver[dof] != other.driver[was] or tables.turns[dof] != other.turns[was]:
+        return False
+    size = len(tables.settings) // DOFS_MAX
+    for place in range(size):
+        if tables.settings[dof * size + place] != other.settings[was * size + place]:
+            return False
+    return tables.device_settings == other.device_settings
+
+
+def _tag(tables):
+    """Return a number that stands for a robot's wiring: a pose is known as long as it stays the same."""
+    tag = tables.dofs
+    for values in (tables.driver, tables.settings, tables.end0_q4us, tables.end1_q4us, tables.relative):
+        for value in values:
+            tag = (tag * 31 + value) & 0xFFFFFF
+    return tag + 1

@@ -12,10 +12,12 @@ from firmware import clock, compositor, functions, weights
 from firmware.actions import Actions
 from firmware.blinks import Blinks
 from firmware.cues import Cues
+from firmware.drivers import Drivers
 from firmware.exchange import Exchange
 from firmware.motor import Motor
 from firmware.programs import Programs
 from firmware.tables import Tables, halves, words
+from firmware.trajectory import Ring
 from shared.formats import (
     DOFS_MAX,
     GRADIENTS,
@@ -42,14 +44,18 @@ class Puppet:
         self.frame_max_us = 0
         self.clock = clock.FrameClock()
         self.cues = Cues()
-        self.tables = Tables()  # those that play
-        self.staged = Tables()  # those that the host fills
-        self.motor = Motor(board, self.tables)
+        self.drivers = Drivers(board)
+        self.tables = Tables(self.drivers)  # those that play
+        self.staged = Tables(self.drivers)  # those that the host fills
+        self.motor = Motor(board, self.drivers, self.tables)
         self.tempo_q16 = words(1)
         self.actions = Actions()
         self.live_target_q28 = words(LIVES_MAX)
         self.base_q15 = halves(DOFS_MAX)
         self.signal_q15 = self.base_q15  # until a signal processing layer stands between them
+        self.base_ring = Ring()
+        self.base_ring_q15 = self.base_ring.value_q15
+        self.signal_ring_q15 = self.motor.trajectory.ring.value_q15
         self._board = board
         self._sine = functions.sine_table()
         self.gradients = halves(NOISE_TABLES * GRADIENTS)
@@ -85,13 +91,12 @@ class Puppet:
             self._rest()
 
     def start(self):
-        """Begin the motion anew: frame 0 is due now. Targets that wait keep their stamps."""
+        """Begin the motion anew: frame 0 is due at a motor tick soon. Targets that wait keep their stamps."""
         self._rest()
         self.frame = 0
         self.frame_max_us = 0
         self.cues.counts[0] = 0
-        self.motor.begin()
-        self.clock.start(self._board.ticks_us(), self.tables.frame_rate_hz)
+        self.clock.start(self.motor.start(), self.tables.frame_rate_hz)
 
     def stop(self):
         """Stand still: no more frames, relative DOFs at 0, absolute DOFs where they are."""
@@ -120,8 +125,8 @@ class Puppet:
             self._exchange_due = True
         return True
 
-    def step(self, silent):
-        """Compute the frame that is due and bring it to the motors; `silent` tells that the link is quiet."""
+    def step(self):
+        """Compute the frame that is due and hand it to the motors."""
         begun_us = self._board.ticks_us()
         self.clock.begin(begun_us)
         if self._exchange_due:
@@ -129,7 +134,8 @@ class Puppet:
             self.exchange.carry_over()
             self._tempos_changed = 1
         self._synthesise()
-        self.motor.move(self.signal_q15, silent)
+        self.base_ring.put(self.frame, self.tables.dofs, self.base_q15)
+        self.motor.put(self.frame, self.signal_q15)
         self.actions.warp(self.tables, self.tempo_q16[0], self.clock.rate_hz)
         clock.advance(self._master, self.tempo_q16[0], self.clock.rate_hz)
         self.frame += 1

@@ -20,10 +20,9 @@ import micropython
 from micropython import const
 
 from firmware.tables import halves, words
-from shared.formats import DOFS_MAX
+from shared.formats import DOFS_MAX, FRAMES_KEPT
 
 ZERO_Q24 = 1 << 28
-FRAMES_KEPT = 16  # in the ring between synthesis and motor ticks
 KNOTS = 4  # recent targets per DOF, the newest first
 
 _DOFS = const(16)
@@ -162,26 +161,52 @@ def _derive(knot: ptr32, slope_q16: ptr32, bend_q15: ptr32, dofs: int):
         d += 1
 
 
+@micropython.viper
+def _store(value_q15: ptr16, ring_q15: ptr16, dofs: int, at: int):
+    """Copy the values of all DOFs to their place in a ring."""
+    d = 0
+    while d < dofs:
+        ring_q15[at + d] = value_q15[d]
+        d += 1
+
+
+class Ring:
+    """Values of all DOFs in the last 16 frames, frame `n` at `(n % 16) * 16`."""
+
+    def __init__(self):
+        self.value_q15 = halves(FRAMES_KEPT * DOFS_MAX)
+
+    def put(self, frame, dofs, value_q15):
+        """Store a frame's values."""
+        _store(value_q15, self.value_q15, dofs, (frame & 15) * _DOFS)
+
+    def rearrange(self, gather_halves, keep, scratch, dofs, newest):
+        """Let the last few frames have other DOFs; those that were not there before are 0."""
+        for frame in range(newest - 3, newest + 1):
+            gather_halves(self.value_q15, keep, scratch, dofs, 0, (frame & 15) * _DOFS)
+
+
 class Trajectory:
     """The course of all DOFs between frames.
 
-    Synthesis writes a frame's targets with `put`; the motor tick calls `advance` and reads `reference_q24`. `late` counts
-    the frames that were not there when they should have taken effect.
+    Synthesis writes a frame's targets with `put`; the motor tick calls `advance` and reads `reference_q24` (with `ZERO_Q24`
+    added). `newest` is the last frame that was put, `late` counts the frames that were not there when they should have
+    taken effect. `ring` keeps the targets.
     """
 
     def __init__(self):
         self.reference_q24 = words(DOFS_MAX)
         self.late = 0
-        self.ring_q15 = halves(FRAMES_KEPT * DOFS_MAX)
-        self.knot = words(KNOTS * DOFS_MAX)
-        self.glide = words(2 * DOFS_MAX)
-        self.changed = bytearray(DOFS_MAX)
-        self._newest = 0  # the last frame that synthesis has written
+        self.newest = 0
+        self.ring = Ring()
+        self._knot = words(KNOTS * DOFS_MAX)
+        self._glide = words(2 * DOFS_MAX)
+        self._changed = bytearray(DOFS_MAX)
         self._effect = 0  # the last frame that has taken effect
         self._part = 0  # of the frame under way, in millionths
         self._step = 0  # millionths of a frame in a tick
         self._delay = 0
-        self._source = None
+        self._source = -1
         self._fade_q15 = self._keep_q15 = self._share_q15 = 0
 
     def load(self, tables):
@@ -193,30 +218,46 @@ class Trajectory:
         self._keep_q15 = exp_q15(1000, _GLIDE_MS * rate_hz)
         self._share_q15 = (1000 * 32768 + _GLIDE_MS * rate_hz // 2) // (_GLIDE_MS * rate_hz)
 
-    def stand(self, dofs, position_q24):
-        """Let every DOF stand where it is, in whatever frame."""
-        _stand(self.knot, self.glide, self.changed, dofs, position_q24)
-
-    def hold(self, dofs, value_q15):
-        """Let these be the targets until the first frame comes."""
-        ring = self.ring_q15
-        at = (self._newest & 15) * _DOFS
+    def hold(self, dofs, position_q24):
+        """Let every DOF stand at its position until the first frame comes."""
+        at = (self.newest & 15) * _DOFS
         for d in range(dofs):
-            ring[at + d] = value_q15[d]
+            self.ring.value_q15[at + d] = (position_q24[d] + 256) >> 9
+        _stand(self._knot, self._glide, self._changed, dofs, position_q24)
 
-    def start(self):
-        """Expect frame 0: its instant is that of the tick that comes next."""
-        self._newest = self._effect = -1
-        self._part = _MICRO - self._delay - self._step
+    def stand_one(self, dof, position_q24):
+        """Let one DOF stand at a position, from which it goes to its targets."""
+        for place in range(dof, KNOTS * _DOFS, _DOFS):
+            self._knot[place] = position_q24
+        self._glide[dof] = self._glide[_DOFS + dof] = ZERO_Q24
+        self._changed[dof] = 1
+
+    def prepare(self):
+        """Expect frame 0; frames may be put from now on."""
+        values = self.ring.value_q15
+        before = (self.newest & 15) * _DOFS
+        for d in range(_DOFS):
+            values[15 * _DOFS + d] = values[before + d]
+        self.newest = -1
         self.late = 0
+
+    def start(self, dofs, position_q24):
+        """Begin with frame 0 in the tick under way, from where every DOF is."""
+        self._effect = -1
+        self._part = _MICRO - self._delay - self._step
+        _stand(self._knot, self._glide, self._changed, dofs, position_q24)
 
     def put(self, frame, dofs, target_q15):
         """Store a frame's targets; they count from this call on."""
-        ring = self.ring_q15
-        at = (frame & 15) * _DOFS
-        for d in range(dofs):
-            ring[at + d] = target_q15[d]
-        self._newest = frame
+        self.ring.put(frame, dofs, target_q15)
+        self.newest = frame
+
+    def rearrange(self, gather_words, gather_halves, keep, scratch, dofs):
+        """Let other tables have other DOFs."""
+        for values in (self._knot, self._glide):
+            for place in range(0, len(values), _DOFS):
+                gather_words(values, keep, scratch, dofs, ZERO_Q24, place)
+        self.ring.rearrange(gather_halves, keep, scratch, dofs, self.newest)
 
     def advance(self, dofs, playing, rest_q15):
         """Take the step of one motor tick.
@@ -228,23 +269,23 @@ class Trajectory:
             part -= _MICRO
             self._next(dofs, playing, rest_q15)
         self._part = part
-        _evaluate(self.knot, self.reference_q24, dofs, (part << 10) // 31250)
+        _evaluate(self._knot, self.reference_q24, dofs, (part << 10) // 31250)
 
     def derive(self, dofs, slope_q16, bend_q15):
         """Write the targets' first and second derivatives, by frames, in Q16 and Q15."""
-        _derive(self.knot, slope_q16, bend_q15, dofs)
+        _derive(self._knot, slope_q16, bend_q15, dofs)
 
     def _next(self, dofs, playing, rest_q15):
         late = 0
-        target_q15 = self.ring_q15
-        at = before = (self._newest & 15) * _DOFS
+        target_q15 = self.ring.value_q15
+        at = before = (self.newest & 15) * _DOFS
         source = 0
         if playing:
             self._effect += 1
             at = (self._effect & 15) * _DOFS
             before = ((self._effect - 1) & 15) * _DOFS if self._effect else at
             source = 1
-            if self._effect > self._newest:
+            if self._effect > self.newest:
                 self.late += 1
                 late = 1
         if rest_q15 is not None:
@@ -254,12 +295,12 @@ class Trajectory:
             late = 0
         if source != self._source:
             self._source = source
-            changed = self.changed
+            changed = self._changed
             for d in range(dofs):
                 changed[d] = 1
         # fmt: off
         _next_knots(
-            self.knot, self.glide, self.changed, dofs, target_q15, at, target_q15, before, late,
+            self._knot, self._glide, self._changed, dofs, target_q15, at, target_q15, before, late,
             self._fade_q15, self._keep_q15, self._share_q15,
         )
         # fmt: on
