@@ -86,7 +86,6 @@ class Telemetry:
         self._heap_free = 0
         self._taps = self._taps_every = self._weights_every = 0
         self._next = 0  # the frame whose taps come next
-        self._dofs = bytearray(FRAMES_KEPT)  # how many a frame had: an exchange of tables may change it
 
     def ask(self, taps, taps_every, weights_every):
         """Tell taps (bits TAP_BASE ..) and weights every so many frames from now on; 0 is never."""
@@ -105,7 +104,6 @@ class Telemetry:
         """Send what is due after a frame. While the link is silent nothing is."""
         puppet = self._puppet
         frame = puppet.frame - 1
-        self._dofs[frame % FRAMES_KEPT] = puppet.tables.dofs
         if puppet.motor.silent:
             self._next = puppet.frame
             return
@@ -113,6 +111,7 @@ class Telemetry:
             self._report_taps(frame)
             if self._taps & TAP_DERIVATIVES and frame % self._taps_every == 0:
                 motor = puppet.motor
+                motor.derive()
                 self._pack_frame(frame)
                 length = _pack_pairs(self._link.out, 6, puppet.tables.dofs, motor.slope_q16, motor.bend_q15)
                 self._link.send(messages.DERIVATIVES, length)
@@ -143,9 +142,8 @@ class Telemetry:
         out = self._link.out
         self._pack_frame(frame)
         out[6] = taps
-        place = frame % FRAMES_KEPT
-        dofs = self._dofs[place]
-        place *= DOFS_MAX
+        dofs = puppet.tables.dofs
+        place = frame % FRAMES_KEPT * DOFS_MAX
         length = _TAPS
         if taps & TAP_BASE:
             length = _pack_values(out, length, dofs, puppet.base_ring_q15, place)
