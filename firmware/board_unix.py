@@ -11,7 +11,7 @@ kind u8, count u16, bytes, repeated:
 
     0  bytes of the link
     1  a pin's level from outside: pin u8, level u8 (2: nobody drives it)
-    2  the ratio at an analogue input: pin u8, ratio_q15 u16
+    2  the level at an analogue input, of 4096 steps: pin u8, level_q12 u16
     3  an I2C device comes or goes: bus u8, address u8, present u8
     4  the main loop's next piece of work takes time: us u32
 
@@ -58,7 +58,7 @@ class Board:
     """A PC that stands in for a Pico, with the same pins. `commands` and `records` are binary files.
 
     `kept` names a file that stands in for the RAM that a reset leaves as it is, `resets` is how often the watchdog has
-    reset the MCU since power on.
+    reset the MCU since power on. It is made when the host has given the first stretch, and knows what has arrived by then.
     """
 
     def __init__(self, commands, records, kept=None, resets=0):
@@ -85,7 +85,7 @@ class Board:
         self._resets = resets
         self._use = bytearray(_PINS)
         self._outside = bytearray(_UNDRIVEN for _ in range(_PINS))
-        self._ratio_q15 = array("H", bytes(2 * _PINS))
+        self._analog_q12 = array("H", bytes(2 * _PINS))
         self._adc_q15 = 0
         self._present = set()
         self._kept_file = kept
@@ -93,6 +93,9 @@ class Board:
         self._kept_changed = False
         self._tag = 0
         self._read_kept()
+        self._next_stretch()
+        while self._arrival_at == 0:
+            self._arrive()
 
     # --- time
 
@@ -257,7 +260,7 @@ class Board:
 
     def adc_start(self, pin):
         """Measure the voltage at a pin."""
-        self._adc_q15 = self._ratio_q15[pin]
+        self._adc_q15 = self._analog_q12[pin] << 3
 
     def adc_read(self):
         """Return what was measured, 32768 being the supply."""
@@ -360,7 +363,7 @@ class Board:
         elif kind == 1:
             self._outside[data[0]] = data[1]
         elif kind == 2:
-            self._ratio_q15[data[0]] = data[1] | data[2] << 8
+            self._analog_q12[data[0]] = data[1] | data[2] << 8
         elif kind == 3:
             device = data[0] << 7 | data[1]
             if data[2]:

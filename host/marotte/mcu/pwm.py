@@ -13,7 +13,8 @@ from typing import NamedTuple
 Q18_BITS = 18
 SLICES = 8
 _WRITE = struct.Struct("<BI")
-_LOW, _HIGH, _ATTACH = -1, -2, -3  # in the log of a pin, where anything from 0 up is an on-time; from _ATTACH down: a place
+_LOW, _HIGH, _ATTACH = -1, -2, -3
+"""In the log of a pin, where anything from 0 up is an on-time; from _ATTACH down are places in the list of phases."""
 
 
 class Drive(NamedTuple):

@@ -23,6 +23,7 @@ from pathlib import Path
 from marotte.errors import MarotteError
 from marotte.images import unix_binary
 from marotte.mcu.base import VirtualMcu
+from marotte.mcu.pca9685 import Pca9685Chip
 from marotte.mcu.pwm import Drive, Pins
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -36,8 +37,9 @@ _RECORD = struct.Struct("<BIH")
 _SENT, _ATTACHED, _WRITTEN, _DRIVEN, _LET_GO, _QUIET, _I2C, _RESET, _DONE = b"SAPLZQIWD"
 _ARRIVAL = struct.Struct("<IBH")
 _ARRIVAL_MAX = 0xFFFF
-_BYTES, _LEVEL, _RATIO, _DEVICE, _BLOCK = range(5)
+_BYTES, _LEVEL, _ANALOG, _DEVICE, _BLOCK = range(5)
 _UNDRIVEN = 2
+_GENERAL_CALL = 0
 
 
 class UnixMcu(VirtualMcu):
@@ -62,8 +64,11 @@ class UnixMcu(VirtualMcu):
         self._resets = 0
         self._waiting: list[tuple[int, int, bytes]] = []
         self._inputs: dict[tuple[int, bytes], bytes] = {}
+        self._outside: dict[int, int | None] = {}  # levels at pins from outside
+        self._driven: dict[int, int] = {}  # those that the MCU gives them
         self._sent: list[tuple[int, bytes]] = []
         self._pins = Pins()
+        self._devices: list[UnixPca9685] = []
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         self._commands = self._records = -1
         self._process: subprocess.Popen[bytes] | None = None
@@ -93,6 +98,8 @@ class UnixMcu(VirtualMcu):
 
     def clear_edges(self) -> None:
         self._pins.clear_edges(self._now_us)
+        for device in self._devices:
+            device.chip.clear_edges(self._now_us)
 
     def drives(self) -> dict[int, Drive]:
         """Return what was written to each PWM pin, in `pulse_q18us`, since power on or `clear_drives`."""
@@ -104,10 +111,23 @@ class UnixMcu(VirtualMcu):
 
     def set_pin(self, pin: int, level: int | None) -> None:
         self._set(_LEVEL, bytes([pin]), bytes([_UNDRIVEN if level is None else level]))
+        self._outside[pin] = level
+        self._level_changed(self._now_us, pin)
 
     def set_adc(self, pin: int, ratio: float) -> None:
         """Set the voltage at an analogue input, as a part of the supply, from now on."""
-        self._set(_RATIO, bytes([pin]), round(ratio * 32768).to_bytes(2, "little"))
+        self._set(_ANALOG, bytes([pin]), min(int(ratio * 4096), 4095).to_bytes(2, "little"))
+
+    def add_pca9685(
+        self, bus: int, address: int = 0x40, oe_pin: int | None = None, clock_hz: float = 25e6
+    ) -> UnixPca9685:
+        """Connect a PCA9685 to I2C bus 0 or 1, its OE to a pin; OE is low where nobody drives it."""
+        device = UnixPca9685(self, bus, address, oe_pin, Pca9685Chip(clock_hz))
+        self._devices.append(device)
+        if oe_pin is not None:
+            self._level_changed(self._now_us, oe_pin)
+        self._tell_presence(device)
+        return device
 
     def block(self, duration_us: int) -> None:
         """Let the main loop be busy for so long from the next instant on at which it has waited for a frame."""
@@ -132,6 +152,20 @@ class UnixMcu(VirtualMcu):
         self._ram.cleanup()
         if self._flash:
             self._flash.cleanup()
+
+    def _tell_presence(self, device: UnixPca9685) -> None:
+        """Tell the board who answers on the device's bus."""
+        on_bus = [other for other in self._devices if other.bus == device.bus]
+        for address in (device.address, _GENERAL_CALL):
+            powered = any(other.chip.powered for other in on_bus if address in (other.address, _GENERAL_CALL))
+            self._set(_DEVICE, bytes([device.bus, address]), bytes([powered]))
+
+    def _level_changed(self, at_us: int, pin: int) -> None:
+        """Tell devices the level at a pin, which is the MCU's if it drives it."""
+        for device in self._devices:
+            if device.oe_pin == pin:
+                level = self._driven.get(pin)
+                device.chip.set_disabled(at_us, bool(self._outside.get(pin) if level is None else level))
 
     def _start(self) -> None:
         """Start a process, and let it run up to the beginning of its time."""
@@ -178,6 +212,10 @@ class UnixMcu(VirtualMcu):
         """Start the firmware anew; the world around it stays."""
         self._resets += 1
         self._pins.reset(self._now_us)
+        self._driven.clear()
+        for device in self._devices:
+            if device.oe_pin is not None:
+                self._level_changed(self._now_us, device.oe_pin)
         self._waiting[:0] = [(self._now_us, kind, which + value) for (kind, which), value in self._inputs.items()]
         self._start()
 
@@ -227,7 +265,7 @@ class UnixMcu(VirtualMcu):
                 at_us = start_us + offset_us
                 if kind == _WRITTEN:
                     self._pins.write(at_us, buffer, data_at, place)
-                elif kind == _DONE or kind == _RESET:
+                elif kind in (_DONE, _RESET):
                     self._buffer = buffer[place:]
                     self._read_printed(at_us)
                     if kind == _RESET:
@@ -246,8 +284,16 @@ class UnixMcu(VirtualMcu):
             self._pins.attach(at_us, *struct.unpack("<BII", data))
         elif kind == _DRIVEN:
             self._pins.drive(at_us, data[0], data[1])
+            self._driven[data[0]] = data[1]
+            self._level_changed(at_us, data[0])
         elif kind == _LET_GO:
             self._pins.drive(at_us, data[0], 0)
+            self._driven.pop(data[0], None)
+            self._level_changed(at_us, data[0])
+        elif kind == _I2C:
+            for device in self._devices:
+                if device.bus == data[0] and device.chip.powered:
+                    device.hear(at_us, data[1], data[2:])
         elif kind == _QUIET:
             self._pins.quiet(at_us)
 
@@ -273,6 +319,38 @@ class UnixMcu(VirtualMcu):
         return MarotteError(
             "\n".join([f"the firmware on {self._binary} failed: {what}", *(f"    {line}" for line in tail)])
         )
+
+
+class UnixPca9685:
+    """A PCA9685 that `UnixMcu.add_pca9685` has connected."""
+
+    def __init__(self, mcu: UnixMcu, bus: int, address: int, oe_pin: int | None, chip: Pca9685Chip):
+        self.bus = bus
+        self.address = address
+        self.oe_pin = oe_pin
+        self.chip = chip
+        self._mcu = mcu
+
+    def edges(self, channel: int) -> list[tuple[int, int]]:
+        """Changes of the level at an output since power on or `clear_edges` of the MCU, as `UnixMcu.edges` has them."""
+        return self.chip.edges(self._mcu.now_us, channel)
+
+    def remove(self) -> None:
+        """Pull the chip out: it no longer answers, and its outputs are low."""
+        self.chip.set_power(self._mcu.now_us, False)
+        self._mcu._tell_presence(self)
+
+    def put_back(self) -> None:
+        """Plug it in again, as it is after power on."""
+        self.chip.set_power(self._mcu.now_us, True)
+        self._mcu._tell_presence(self)
+
+    def hear(self, at_us: int, address: int, data: bytes) -> None:
+        """Take a transfer on the bus, to whomever."""
+        if address == self.address:
+            self.chip.write(at_us, data)
+        elif address == _GENERAL_CALL:
+            self.chip.general_call(at_us, data)
 
 
 def _write_all(descriptor: int, data: bytes) -> None:
