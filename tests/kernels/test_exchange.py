@@ -15,6 +15,9 @@ any_word = integers(-(1 << 31), (1 << 31) - 1, 0)
 any_half = integers(0, 65535)
 places = st.lists(st.integers(0, COUNT - 1) | st.just(formats.NEW), min_size=COUNT, max_size=COUNT)
 counts = st.integers(0, COUNT)
+ROWS = 3
+rows = st.integers(0, ROWS - 1)
+"""An array may have several values for each owner, row by row."""
 
 
 def lists_of(numbers):
@@ -26,18 +29,24 @@ def gathered(values, old, count, fresh):
     return new + values[count:]
 
 
-@given(lists_of(any_word), places, counts, any_word)
-def test_words_go_where_their_owners_went(values, old, count, fresh):
-    found = words(values)
-    MODULE.gather_words(found, bytes(old), words([-1] * COUNT), count, fresh)
-    assert list(found) == gathered(values, old, count, fresh)
+@given(lists_of(any_word), places, counts, any_word, rows)
+def test_words_go_where_their_owners_went(values, old, count, fresh, row):
+    others = [[n] * COUNT for n in range(ROWS)]
+    others[row] = values
+    found = words(sum(others, []))
+    MODULE.gather_words(found, bytes(old), words([-1] * COUNT), count, fresh, row * COUNT)
+    others[row] = gathered(values, old, count, fresh)
+    assert list(found) == sum(others, [])
 
 
-@given(lists_of(any_half), places, counts, any_half)
-def test_halves_go_where_their_owners_went(values, old, count, fresh):
-    found = halves(values)
-    MODULE.gather_halves(found, bytes(old), words([-1] * COUNT), count, fresh)
-    assert list(found) == gathered(values, old, count, fresh)
+@given(lists_of(any_half), places, counts, any_half, rows)
+def test_halves_go_where_their_owners_went(values, old, count, fresh, row):
+    others = [[n] * COUNT for n in range(ROWS)]
+    others[row] = values
+    found = halves(sum(others, []))
+    MODULE.gather_halves(found, bytes(old), words([-1] * COUNT), count, fresh, row * COUNT)
+    others[row] = gathered(values, old, count, fresh)
+    assert list(found) == sum(others, [])
 
 
 @given(places, *[lists_of(tempos_q16)] * 4, counts)
