@@ -253,8 +253,9 @@ class Guards:
             bit = self._pending & -self._pending
             self._pending ^= bit
             self._attach(bit)
-            self._next_us = (now_us + self._motor.tables.attach_ms * 1000 - TICKS_MASK - 1) & TICKS_MASK
-            if self._motor.tables.attach_ms:
+            pause_us = self._motor.tables.attach_ms * 1000
+            self._next_us = (now_us - (TICKS_MASK - pause_us) - 1) & TICKS_MASK  # the plain sum may pass 2^30
+            if pause_us:
                 return
 
     def _attach(self, mask):
