@@ -97,7 +97,8 @@ class Tables:
     of range. Order: `begin`, then `robot`, `device`, `dof` 0, 1, .., what a DOF has (`character`, `output`, `feedback`,
     `guard`), `action` 0, 1, .., `mappings`, `live`, each in its place exactly once.
 
-    `drivers` checks the settings of outputs and devices (`check_output`, `check_device`); None leaves them unchecked.
+    `drivers` checks the settings of outputs and devices (`check_output`, `check_device`) and knows which pins they use
+    (`uses`); None leaves all that unchecked.
     """
 
     def __init__(self, drivers=None):
@@ -419,6 +420,8 @@ class Tables:
         if dof >= self._dofs_seen or self.relative[dof] or self.feedback_pin[dof] != NO_PIN:
             return 0
         if not FEEDBACK_PIN_FIRST <= pin <= FEEDBACK_PIN_LAST or pin == self.kill_pin:
+            return 1
+        if self._drivers is not None and self._drivers.uses(self, pin):
             return 1
         for other in range(self._dofs_seen):
             if self.feedback_pin[other] == pin:

@@ -78,6 +78,9 @@ class Drivers:
         assert tables.driver[dof] == formats.NO_DRIVER and tables.turns[dof] >= 1
         return self.check_device(driver, settings, count)
 
+    def uses(self, tables, pin):
+        return pin == 28
+
 
 def carry_out(tables, method, arguments):
     """Call a method of the tables, one that sets what plays only if its check allows it; return the number of the bad field."""
@@ -294,6 +297,11 @@ def test_feedback_inputs_are_used_once_and_not_by_the_kill_pin():
     assert tables.feedback(*GOOD["feedback"].values()) is None
     assert tables.feedback(*(GOOD["feedback"] | {"dof": 1}).values()) == 1
     assert tables.feedback(*(GOOD["feedback"] | {"dof": 1, "pin": 28}).values()) is None
+    tables = MODULE.Tables(Drivers())
+    tables.begin(*BEGIN.values())
+    tables.robot(*ROBOT.values())
+    tables.dof(*GOOD["dof"].values())
+    assert tables.feedback(*(GOOD["feedback"] | {"pin": 28}).values()) == 1, "an output has it"
     assert loaded(kind=formats.KIND_RELATIVE).feedback(*GOOD["feedback"].values()) == 0, "a speed is not measured"
 
 
