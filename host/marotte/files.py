@@ -38,6 +38,17 @@ def load(puppet_path: str | Path, score_path: str | Path, robot_path: str | Path
     return Files(puppet, score, robot)
 
 
+def load_pair(puppet_path: str | Path, robot_path: str | Path) -> tuple[Puppet, Robot]:
+    """Return a puppet and its robot. Raises FileMistakes, with the mistakes of both files."""
+    puppet, mistakes = read_puppet(puppet_path)
+    if not puppet.dofs:
+        raise FileMistakes(mistakes)
+    robot, robot_mistakes = wiring.read_robot(robot_path, puppet)
+    if mistakes or robot_mistakes:
+        raise FileMistakes([*mistakes, *robot_mistakes])
+    return puppet, robot
+
+
 class Watch:
     """Loads the files of a performance again when one of them has changed, and been left alone since the last look."""
 

@@ -44,6 +44,13 @@ _BY_NAME = {message[0]: message for message in messages.MESSAGES}
 _BY_ID = {message[1]: message for message in messages.MESSAGES}
 
 
+_HINTS = {
+    ("arm", messages.STATE): "; has the robot outputs, and is its kill switch where it should be?",
+    ("save_begin", messages.STATE): "; the MCU writes its flash only while the puppet stands and its outputs are off",
+    ("save_erase", messages.STATE): "; the MCU writes its flash only while the puppet stands and its outputs are off",
+}
+
+
 class LinkError(MarotteError):
     """The link does not work, or the MCU refused a command."""
 
@@ -57,7 +64,7 @@ class LinkRefused(LinkError):
 
     def __init__(self, name: str, status: int, detail: int):
         text = messages.STATUS_TEXT[status] if status < len(messages.STATUS_TEXT) else f"status {status}"
-        super().__init__(f"the MCU refused {name!r}: {text} (detail {detail})")
+        super().__init__(f"the MCU refused {name!r}: {text} (detail {detail}){_HINTS.get((name, status), '')}")
         self.status = status
         self.detail = detail
 

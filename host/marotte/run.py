@@ -15,7 +15,7 @@ from marotte.link import Carrier, LinkRefused
 from marotte.prompter import Prompter
 from marotte.puppet import Puppet
 from marotte.score import Score, resumed, state
-from marotte.session import Session
+from marotte.session import Session, killer
 from marotte.tables import build_tables, value_of
 from marotte.tomlfile import FileMistakes
 from marotte.view import REFRESH_HZ, Scene, View
@@ -26,6 +26,8 @@ AFTERGLOW_S = 2.0
 """How long a run goes on after the last cue if its length is not given: its weights need a moment to get there."""
 PUMP_US = 20_000
 WEIGHTS_HZ = 5
+STATUS_US = 500_000
+"""How often the MCU is asked for its counters."""
 SILENT_S = 0.5
 """A view without a new frame for so long says so."""
 FAREWELL_S = 1.0
@@ -94,6 +96,8 @@ class _Play:
         self._arm = arm
         self._seconds = seconds
         self._quiet_us = 0
+        self._asked_us = 0
+        self._status: dict[str, int] = {}
         self._take(files)
         self._prompter = Prompter(session, self._steps, session.welcome["queue_max"])
 
@@ -116,6 +120,7 @@ class _Play:
         self.session.pump(PUMP_US)
         self._quiet_us += PUMP_US
         self._take_telemetry()
+        self._look_at_status()
         self.scene.is_silent = self._quiet_us > SILENT_S * 1e6
         self._prompter.reached(self.scene.frame)
         self._tell_cues()
@@ -134,8 +139,9 @@ class _Play:
         """Replace puppet and score. Raises LinkRefused if the MCU does not take them; nothing has changed then."""
         before = self.files.puppet
         tables = build_tables(files.puppet, files.robot)
+        tick_before_s = build_tables(before, self.files.robot).tick_s
         begin_us = self.session.carrier.now_us()
-        if files.puppet.frame_rate_hz != before.frame_rate_hz:
+        if files.puppet.frame_rate_hz != before.frame_rate_hz or tables.tick_s != tick_before_s:
             try:
                 self.session.upload(tables)
             except LinkRefused:
@@ -143,7 +149,8 @@ class _Play:
                 self._restart(self.files)
                 raise
             self._restart(files)
-            how = f"with a new frame rate: its motion begins anew at {files.puppet.frame_rate_hz} frames a second"
+            rates = f"{files.puppet.frame_rate_hz} frames and {float(1 / tables.tick_s):.0f} motor ticks a second"
+            how = f"with another rate: its motion begins anew at {rates}"
         else:
             self.session.exchange(tables, before)
             took_ms = (self.session.carrier.now_us() - begin_us) / 1000
@@ -155,6 +162,7 @@ class _Play:
 
     def _restart(self, files: Files) -> None:
         self.scene = Scene()
+        self._status = {}
         self.session.taps.clear()
         self._take(files)
         self._prompter = Prompter(self.session, self._steps, self.session.welcome["queue_max"])
@@ -203,6 +211,41 @@ class _Play:
         _, weights_q12 = self.session.weights
         known = {index: weight for index, weight in weights_q12.items() if index < len(self._actions)}
         self.scene.weights = {self._actions[index]: weight / WEIGHT_Q12_ONE for index, weight in known.items()}
+
+    def _look_at_status(self) -> None:
+        """Ask for the MCU's counters now and then, show and tell what they say."""
+        status = self.session.take_status()
+        if status:
+            self._tell_status(status)
+        now_us = self.session.carrier.now_us()
+        if now_us - self._asked_us >= STATUS_US:
+            self._asked_us = now_us
+            self.session.request_status()
+
+    def _tell_status(self, status: dict[str, int]) -> None:
+        before, self._status = self._status, status
+        scene = self.scene
+        scene.late_frames = status["late_frames"]
+        stalled = self._names(status["stalled"])
+        for name in stalled - scene.stalled:
+            self.view.note(f"{name} has stalled: it is without pulses until it is armed again")
+        scene.stalled = stalled
+        scene.released = self._names(status["released"]) - stalled if status["armed"] else frozenset()
+        chips = list(self.files.robot.chips) if self.files.robot else []
+        gone_before = before.get("bus_gone", 0)
+        for index, chip in enumerate(chips):
+            if (status["bus_gone"] ^ gone_before) >> index & 1:
+                gone = status["bus_gone"] >> index & 1
+                self.view.note(f"the chip {chip} {'does not answer' if gone else 'answers again'}")
+        if before.get("armed") and not status["armed"]:
+            self.view.note(f"all pulses are off: killed by {killer(status)}")
+        alerts = [f"killed by {killer(status)}"] if self._arm and not status["armed"] and before else []
+        alerts += [f"{chip} does not answer" for index, chip in enumerate(chips) if status["bus_gone"] >> index & 1]
+        scene.alert = ", ".join(alerts)
+
+    def _names(self, bits: int) -> frozenset[str]:
+        """Return the DOFs of a status' bits."""
+        return frozenset(dof.name for index, dof in enumerate(self._dofs) if bits >> index & 1)
 
     def _tell_cues(self) -> None:
         while self._cues and self._cues[0][0] <= self.scene.frame:
