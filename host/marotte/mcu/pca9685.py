@@ -79,6 +79,10 @@ class Pca9685Chip:
         self._catch_up(at_us)
         return self._edges[channel]
 
+    def registers(self) -> bytes:
+        """Return all 256 registers."""
+        return bytes(self._registers)
+
     def clear_edges(self, at_us: int) -> None:
         """Forget all edges up to now."""
         self._catch_up(at_us)

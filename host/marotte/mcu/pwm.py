@@ -43,11 +43,10 @@ class Pins:
                 phase = other.phase
         self._pin(pin).attach(at_us, phase)
 
-    def write(self, at_us: int, data: bytes, start: int, end: int) -> None:
+    def write(self, at_us: int, data: bytes) -> None:
         """Set on-times from the next period on: pin u8, pulse_q18us u32, repeated. A pin without PWM stays as it is."""
         pins = self._pins
-        for place in range(start, end, 5):
-            pin, pulse_q18us = _WRITE.unpack_from(data, place)
+        for pin, pulse_q18us in _WRITE.iter_unpack(data):
             model = pins.get(pin)
             if model and model.pwm:
                 model.log_us.append(at_us)
