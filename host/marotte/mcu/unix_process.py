@@ -1,6 +1,6 @@
 """One process of MicroPython's unix port, from power on or reset to the next, and its files of commands and records.
 
-The formats are described in `firmware/board_unix.py`.
+The formats are described in `firmware/unix_time.py`.
 """
 
 from __future__ import annotations
