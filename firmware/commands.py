@@ -48,7 +48,8 @@ def _word(body, at):
 class Commands:
     """Carries out the commands for one puppet.
 
-    `detail` explains the last status. `dictionary` is the checksum of the message dictionary.
+    `detail` explains the last status. `dictionary` is the checksum of the message dictionary. `store` keeps what is to be
+    kept on the flash.
     """
 
     def __init__(self, puppet, telemetry, store):
@@ -56,7 +57,7 @@ class Commands:
         self.dictionary = codec.crc32(messages.canonical_text().encode())
         self._puppet = puppet
         self._telemetry = telemetry
-        self._store = store
+        self.store = store
         self._hello = pack(_HELLO_FORMAT, messages.PROTOCOL, self.dictionary)
         self._settings = halves(DEVICE_SETTINGS_MAX)
         # By message id: length of the fields (-1: no such message), of an item, and what carries it out.
@@ -322,16 +323,16 @@ class Commands:
     # --- what is kept on the flash
 
     def _on_save_begin(self, body, length):
-        return self._may_save() or self._saved(self._store.begin(*self._fields(messages.SAVE_BEGIN, body)))
+        return self._may_save() or self._saved(self.store.begin(*self._fields(messages.SAVE_BEGIN, body)))
 
     def _on_save(self, body, length):
-        return self._may_save() or self._saved(self._store.put(_word(body, 0), body, _PAYLOAD + 4, length - 4))
+        return self._may_save() or self._saved(self.store.put(_word(body, 0), body, _PAYLOAD + 4, length - 4))
 
     def _on_save_end(self, body, length):
-        return self._may_save() or self._saved(self._store.end())
+        return self._may_save() or self._saved(self.store.end())
 
     def _on_save_erase(self, body, length):
-        return self._may_save() or self._saved(self._store.erase())
+        return self._may_save() or self._saved(self.store.erase())
 
     def _may_save(self):
         """Return whether flash may be written: that blocks interrupts, on which kill and all motion depend."""
@@ -340,5 +341,5 @@ class Commands:
 
     def _saved(self, status):
         if status:
-            self.detail = self._store.detail
+            self.detail = self.store.detail
         return status

@@ -71,17 +71,15 @@ class Store:
     """The file on the flash.
 
     `state` tells what became of it when the MCU was switched on: STORE_NONE, STORE_PLAYED or STORE_DAMAGED. The methods
-    `begin` .. `erase` return a status, `detail` explains it.
+    return a status, `detail` explains it.
     """
 
     def __init__(self, files=None):
         self.state = STORE_NONE
         self.detail = 0
-        self._files = files or Files()
+        self.files = files or Files()
         self._file = None  # the new one, while it is being written
         self._bytes = self._place = 0
-
-    # --- from the link
 
     def begin(self, count, crc32):
         """Begin a new file of so many bytes; one that was under way is forgotten."""
@@ -91,7 +89,7 @@ class Store:
         self._place = 0
         try:
             self._close()
-            self._file = self._files.open(NEW_NAME, "wb")
+            self._file = self.files.open(NEW_NAME, "wb")
             self._file.write(pack(HEADER, count, crc32))
         except OSError as error:
             return self._fail(error)
@@ -120,12 +118,12 @@ class Store:
             return self._refuse(messages.INCOMPLETE, self._bytes - self._place)
         try:
             self._close()
-            with self._files.open(NEW_NAME, "rb") as file:
+            with self.files.open(NEW_NAME, "rb") as file:
                 if not _is_whole(file):
                     return self._refuse(messages.RANGE, 1)
                 if not _is_in_order(file):
                     return self._refuse(messages.RANGE, 0)
-            self._files.rename(NEW_NAME, NAME)
+            self.files.rename(NEW_NAME, NAME)
         except OSError as error:
             return self._fail(error)
         return messages.OK
@@ -135,7 +133,7 @@ class Store:
         for name in (NAME, NEW_NAME):
             try:
                 self._close()
-                self._files.remove(name)
+                self.files.remove(name)
             except OSError as error:
                 if error.errno != _ENOENT:
                     return self._fail(error)
@@ -158,26 +156,27 @@ class Store:
             pass  # it is the first failure that is told
         return self._refuse(messages.FLASH, error.errno or 0)
 
-    # --- when the MCU is switched on
 
-    def load(self, commands):
-        """Carry out the file's commands, all or none, and arm if the robot says so. To be called before any frame."""
-        try:
-            file = self._files.open(NAME, "rb")
-        except OSError:
-            return
-        self.state = STORE_DAMAGED
-        try:
-            with file:
-                if not _is_whole(file) or not _is_in_order(file):
-                    return
-                if not _play(file, commands):
-                    commands.withdraw()
-                    return
-        except OSError:
-            return
-        self.state = STORE_PLAYED
-        commands.arm_if_autostart()
+def load(commands):
+    """Carry out the file's commands, all or none, and arm if the robot says so. To be called before any frame."""
+    store = commands.store
+    try:
+        file = store.files.open(NAME, "rb")
+    except OSError:
+        return
+    store.state = STORE_DAMAGED
+    try:
+        with file:
+            if not _is_whole(file) or not _is_in_order(file):
+                return
+            if not _play(file, commands):
+                commands.withdraw()
+                return
+    except OSError:
+        commands.withdraw()
+        return
+    store.state = STORE_PLAYED
+    commands.arm_if_autostart()
 
 
 def _is_whole(file):

@@ -150,8 +150,7 @@ class Mcu:
     def __init__(self, files=None):
         self.puppet = Puppet()
         self.flash = files if isinstance(files, FakeFiles) else FakeFiles(files)
-        self.store = STORE.Store(self.flash)
-        self.commands = COMMANDS.Commands(self.puppet, Telemetry(), self.store)
+        self.commands = COMMANDS.Commands(self.puppet, Telemetry(), STORE.Store(self.flash))
 
     def do(self, name, fields=None, items=None):
         """Carry out a command as from the link; return its status, with the detail unless it is done."""
@@ -169,8 +168,8 @@ class Mcu:
 
     def load(self):
         """Play the file, as at the start; return what became of it."""
-        self.store.load(self.commands)
-        return self.store.state
+        STORE.load(self.commands)
+        return self.commands.store.state
 
 
 def piece(data):
@@ -412,6 +411,31 @@ def test_erasing_removes_the_file_and_may_be_repeated():
         assert mcu.flash.files == {}
     assert mcu.do("save", {"place": 0}, piece(b"x")) == (messages.STATE, 0)
     assert Mcu(mcu.flash.files).load() == formats.STORE_NONE
+
+
+def test_file_that_cannot_be_read_to_its_end_leaves_nothing_in_force():
+    class Failing(FakeFile):
+        def read(self, count):
+            self._files.reads += 1
+            if self._files.reads > self._files.good_reads:
+                raise OSError(5, "input or output")
+            return super().read(count)
+
+    class Files(FakeFiles):
+        reads = 0
+
+        def open(self, name, mode):
+            return Failing(self, name, mode)
+
+    for good_reads in range(60):
+        flash = Files({STORE.NAME: as_file(with_autostart())})
+        flash.good_reads = good_reads
+        mcu = Mcu(flash)
+        if mcu.load() == formats.STORE_PLAYED:
+            break
+        assert mcu.puppet.frame == -1 and mcu.puppet.cues.count == 0 and not mcu.puppet.motor.armed
+        assert mcu.do("start") == (messages.STATE, 0)
+    assert good_reads > 30
 
 
 @pytest.mark.parametrize("failing", ["open", "write", "close", "rename"])
