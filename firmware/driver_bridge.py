@@ -11,6 +11,7 @@ long been low. At no instant does the old duty meet the new direction, or do bot
 import micropython
 from micropython import const
 
+from firmware.driver import Driver
 from firmware.tables import words
 from shared.formats import DOFS_MAX, DRIVER_BRIDGE, SETTINGS_MAX
 
@@ -48,12 +49,10 @@ def _steer(count: int, level_q24: ptr32, attached: ptr8, invert: ptr8, due: int,
         d += 1
 
 
-class BridgeDriver:
+class BridgeDriver(Driver):
     """All motors on H-bridges."""
 
-    in_tick = True
     pins = (1, 2)
-    device_pins = ()
 
     def __init__(self, board):
         self._board = board
@@ -70,10 +69,6 @@ class BridgeDriver:
     def pwm(self, settings, place):
         """Return the numbers of the settings that are PWM pins."""
         return (1, 2) if settings[place] else (1,)
-
-    def check_device(self, settings, count):
-        """Bridges need no device."""
-        return 0
 
     def check_output(self, tables, dof, settings, count):
         """Return None, or the number of the setting that is missing, surplus or out of range; `Drivers` looks at the pins."""

@@ -19,12 +19,11 @@ import micropython
 from micropython import const
 
 from firmware.clock import ticks_diff
+from firmware.driver import Driver
 from shared.formats import (
     DEVICE_SETTINGS_MAX,
     DEVICES_MAX,
-    DOFS_MAX,
     DRIVER_PCA9685,
-    NO_DRIVER,
     NO_PIN,
     SETTINGS_MAX,
 )
@@ -110,7 +109,8 @@ class _Chip:
         self._waits = False  # a channel has to be switched off
         self._quiets = 0
         self._scale_q21 = 0
-        self._steps = [_SLEEP, _TOTEM_POLE, bytearray((_PRESCALE, 0)), _ALL_OFF, _WAKE, _RESTART]
+        self._divider = bytearray((_PRESCALE, 0))
+        self._steps = (_SLEEP, _TOTEM_POLE, self._divider, _ALL_OFF, _WAKE, _RESTART)
         self._dof = bytearray([_NO_DOF] * _CHANNELS)
         self._dof_before = bytearray([_NO_DOF] * _CHANNELS)
         self._registers = bytearray(1 + 4 * _CHANNELS)
@@ -130,11 +130,10 @@ class _Chip:
             settings[number] = value
         self.oe = settings[3] if used else NO_PIN
         period_us = self._take_channels(tables, device)
-        divider = self._steps[2]
         if used and period_us:
             wanted = prescale(settings[5], period_us)
-            same = same and wanted == divider[1]
-            divider[1] = wanted
+            same = same and wanted == self._divider[1]
+            self._divider[1] = wanted
             self._scale_q21 = (settings[5] << 21) // (1000 * (wanted + 1))
         if not same or not period_us:
             self.attached = 0
@@ -185,6 +184,8 @@ class _Chip:
     def release(self, dof):
         """Take them away with the next transfer."""
         self.attached &= ~(1 << dof)
+        if self.attached == 0:
+            self.fresh = False
         self._waits = True
 
     def quiet(self):
@@ -246,7 +247,7 @@ class _Chip:
         """Send bytes; return whether they have arrived. If they have not, the chip is gone."""
         for _ in range(self._attempts):
             try:
-                if self._bus.writeto(self._address, data) == len(data):
+                if self._bus is not None and self._bus.writeto(self._address, data) == len(data):
                     return True
             except OSError:
                 pass
@@ -257,21 +258,16 @@ class _Chip:
         return False
 
 
-class Pca9685Driver:
+class Pca9685Driver(Driver):
     """All servos on PCA9685 chips."""
 
     in_tick = False
-    pins = ()
     device_pins = (0, 1, 3)
 
     def __init__(self, board):
         self._board = board
         self._chips = [_Chip(board) for _ in range(DEVICES_MAX)]
         self._enabled = bytearray(DEVICES_MAX)  # whether OE is low
-
-    def pwm(self, settings, place):
-        """Return the numbers of the settings that are PWM pins."""
-        return self.pins
 
     def check_device(self, settings, count):
         """Return None, or the number of the setting that is missing, surplus or out of range."""
@@ -328,10 +324,6 @@ class Pca9685Driver:
         if sda >> 1 & 1 != its_sda >> 1 & 1:  # the I2C controller
             return True
         return sda == its_sda and scl == its_scl and baud_khz == its_baud_khz and address != its_address
-
-    def period_us(self, tables, dof):
-        """Return the time from pulse to pulse that is wanted."""
-        return tables.turns[dof] * tables.motor_period_us
 
     def load(self, tables):
         """Keep the pulses of channels that stay, on chips that stay as they are."""

@@ -1,22 +1,6 @@
-"""The drivers of outputs: which there are, and what they have in common.
+"""The drivers of outputs, and what concerns them all: which pins are taken, and which DOF has which driver.
 
-A driver is one object for all outputs of its kind. It knows the outputs by the number of their DOF and has
-
-    in_tick                                       whether it writes in the motor tick, or from the main loop (`flush`)
-    pins                                          the settings of an output that are pins
-    pwm(settings, place)                          those that are PWM pins, of the settings from a place on
-    device_pins                                   the settings of a device that are pins
-    check_device(settings, count)                 None, or the number of the bad setting
-    check_output(tables, dof, settings, count)    the same; pins are compared with all others here, in `Drivers`
-    period_us(tables, dof)                        of the pulses of an output
-    load(tables)                                  a new set of tables plays; returns the DOFs whose output goes on, as bits
-    attach(dof, until_us), release(dof), quiet()
-    write(level_q24, pulse_q18us, due)            if `in_tick`; else it is called `flush`
-    attend(now_us)                                main loop, only if not `in_tick`: what is to be done again or later
-    bus_errors(), bus_gone()                      of those that write later
-
-What the tick may call (`attach`, `release`, `write`, `quiet`) allocates nothing and takes a bounded time. A new driver is
-a file of its own, a code in `shared/formats.py` and an entry in `_KINDS`.
+A new driver is a file of its own (see `firmware/driver.py`), a code in `shared/formats.py` and an entry in `_KINDS`.
 """
 
 from firmware.driver_bridge import BridgeDriver
@@ -27,7 +11,6 @@ from shared.formats import (
     DEVICES_MAX,
     DOFS_MAX,
     NO_DRIVER,
-    NO_PIN,
     SETTINGS_MAX,
 )
 
@@ -173,19 +156,19 @@ class Drivers:
 
     def attend(self, now_us):
         """In the main loop, all the time: start devices, find those that have come back, send what waits."""
-        for driver in self._later:
+        for driver in self._drivers:
             driver.attend(now_us)
 
     def bus_errors(self):
         """Return how many transfers have failed since the start."""
         errors = 0
-        for driver in self._later:
+        for driver in self._drivers:
             errors += driver.bus_errors()
         return errors
 
     def bus_gone(self):
         """Return which devices do not answer, one bit for each."""
         gone = 0
-        for driver in self._later:
+        for driver in self._drivers:
             gone |= driver.bus_gone()
         return gone
