@@ -208,7 +208,9 @@ class Feedback:
         self._channels = 0
         self._turn = 0  # the channel whose conversion comes next
         self._under_way = _NOBODY  # the channel that is being converted
+        self._rates = (0, 0)  # what the following two have been computed for: motor period, number of channels
         self._lag_q15 = 0
+        self._fade_q15 = 0
         self._is_new = True
         self._settings = words(16 * CHANNELS)
         self._state = words(4 * CHANNELS)
@@ -242,6 +244,10 @@ class Feedback:
         channels = 0
         for dof in range(tables.dofs):
             channels += tables.feedback_pin[dof] != NO_PIN
+        if self._rates != (tables.motor_period_us, channels):
+            self._rates = tables.motor_period_us, channels
+            self._lag_q15 = 32768 - exp_q15(tables.motor_period_us, _LAG_US)
+            self._fade_q15 = 32768 - exp_q15(channels * tables.motor_period_us, _FADE_US)
         channel = 0
         for place in range(4):
             self._masks[place] = 0
@@ -270,14 +276,13 @@ class Feedback:
             settings[s + _STALL_Q24] = tables.stall_q15[dof] << 9 if is_watched else _OFF_Q24
             settings[s + _STALL_TICKS] = tables.stall_ticks[dof]
             settings[s + _TURNS] = channels
-            settings[s + _FADE_Q15] = 32768 - exp_q15(channels * tables.motor_period_us, _FADE_US)
+            settings[s + _FADE_Q15] = self._fade_q15
             integral = kept.get((pin, at0_q15, at1_q15), _ZERO_Q28) - _ZERO_Q28
             state[t + _SUM_Q28] = max(-limit_q24 << 4, min(integral, limit_q24 << 4)) + _ZERO_Q28
             state[t + _LAGGED] = state[t + _MEASURED] = ZERO_Q24
             state[t + _RUN] = 0
             self._channel_of[dof] = channel
             channel += 1
-        self._lag_q15 = 32768 - exp_q15(tables.motor_period_us, _LAG_US)
         self._turn = 0
         self._under_way = _NOBODY
         self._is_new = True
@@ -287,9 +292,12 @@ class Feedback:
         """Read the conversion that the last tick has started, start the next one, and write the corrections.
 
         `attached` has the bit of each DOF that has pulses, `position_q24` is where the DOFs are led, corrections included,
-        `correction_q24` (with `ZERO_Q24` added) what these are. Allocates nothing.
+        `correction_q24` (with `ZERO_Q24` added) what these are, as they were written last. Allocates nothing.
         """
-        settings, state, masks, channels = self._settings, self._state, self._masks, self._channels
+        settings = self._settings
+        state = self._state
+        masks = self._masks
+        channels = self._channels
         if self._is_new:
             self._is_new = False
             masks[_BEFORE] = 0
@@ -299,7 +307,9 @@ class Feedback:
                 integral = state[4 * channel + _SUM_Q28] - _ZERO_Q28
                 correction_q24[settings[16 * channel]] = (integral >> 4) + _ZERO
         if channels:
-            board, turn, read = self._board, self._turn, self._under_way
+            board = self._board
+            turn = self._turn
+            read = self._under_way
             ratio_q15 = board.adc_read() if read != _NOBODY else 0
             board.adc_start(settings[16 * turn + _PIN])
             self._under_way = turn
@@ -318,7 +328,8 @@ class Feedback:
     def start(self, dof):
         """Return the command that leaves a DOF where it is, Q24 in 0..1, or -1 if that is not known.
 
-        It is the measured value and what has been learnt of the offset: pulses that begin there move nothing.
+        It is the measured value and what has been learnt of the offset: pulses that begin there move nothing. The
+        correction is part of it and stays; the course begins at the command without it.
         """
         if not self._masks[_VALID] & (1 << dof):
             return -1
