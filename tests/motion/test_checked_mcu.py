@@ -30,7 +30,7 @@ def test_each_function_that_is_checked_exists_and_is_listed_once():
 
 def test_integer_that_would_allocate_is_told_with_its_place(monkeypatch):
     monkeypatch.setattr(checked_mcu, "SMALL_INT_FUNCTIONS", (*SMALL_INT_FUNCTIONS, "Motor._set_rates"))
-    with pytest.raises(IntegerRange, match="Motor._set_rates"), CheckedMcu() as mcu:
+    with pytest.raises(IntegerRange, match=r"Motor\._set_rates"), CheckedMcu() as mcu:
         mcu.run_for(1000)
 
 
