@@ -289,6 +289,7 @@ class Board:
         self._handler = _nothing
         self._period_us = 0
         self._due_us = 0
+        self._settled = False  # whether that is exact
         self._ticks = 0
         self._use = bytearray(_PINS)
         self._sliced = bytearray(_PINS)  # whether the slice has had pulses for this pin since it was started
@@ -320,22 +321,20 @@ class Board:
         """Call `handler` each `period_us` from now on, in interrupts, the first time in one period.
 
         Ticks keep to their nominal instants, whatever one of them comes late by; none is left out. Periods of servos begin
-        anew with the pins that are attached next. Allocates; not to be called under `lock`.
+        anew with the pins that are attached next.
         """
         self.stop_ticks()
         for number in range(8):
             self._slice_us[number] = 0
         self._handler = handler
         self._period_us = period_us
-        first_us = _later(time.ticks_us(), period_us)
+        self._due_us = _later(time.ticks_us(), period_us)
+        self._settled = False
         # fmt: off
         self._timer.init(  # type: ignore[call-overload]  # the stub knows no period in microseconds
             mode=machine.Timer.PERIODIC, period=period_us, tick_hz=1000000, hard=True, callback=self._on_timer
         )
         # fmt: on
-        self._due_us = _alarm_us()
-        if not 0 <= ticks_diff(self._due_us, first_us) < _ALARM_SLACK_US:
-            self._due_us = first_us  # somebody else's alarm comes first
 
     def stop_ticks(self):
         """Call the handler no more."""
@@ -344,9 +343,26 @@ class Board:
 
     def tick_due_us(self):
         """Return the nominal instant of the next tick, modulo 2^30; asked in the handler, of the one after."""
+        if not self._settled:
+            self._settle()
         return self._due_us
 
+    def _settle(self):
+        """Replace the guessed instant of the first tick by that for which the timer is set, once it is.
+
+        The guess is early by what MicroPython takes to set the timer; anything else is somebody else's alarm.
+        """
+        state = machine.disable_irq()
+        alarm_us = _alarm_us()
+        if 0 <= ticks_diff(alarm_us, self._due_us) < _ALARM_SLACK_US:
+            self._due_us = alarm_us
+            self._settled = True
+        machine.enable_irq(state)
+
     def _tick(self, _timer):
+        if not self._settled:
+            self._settle()
+            self._settled = True
         self._due_us = _later(self._due_us, self._period_us)
         self._ticks = (self._ticks + 1) & 0xFFFF
         self._handler()

@@ -4,7 +4,7 @@ Settings of a device: `sda, scl, address, oe, baud_khz, clock_khz`; of an output
 of the DOF's turn among the motor ticks, to what the chip's divider can do; a pulse is a multiple of its 4096th part (4.9 us at
 50 Hz), which is all that the chip resolves.
 
-I2C takes its time and may fail, so the chip is written from the main loop (`flush`), soon after the tick: all channels in use in
+I2C takes its time and may fail, so a chip is set up and written from the main loop (`flush`), soon after the tick: all channels in use in
 one burst, which the chip takes over together, at the STOP, each channel at the end of its period (data sheet, 7.3.3).
 A transfer that fails is repeated at once, twice; then the device counts as gone. It is asked for again every 500 ms, and set up
 anew when it answers: its channels start with the present values. A stuck bus holds the main loop up for as long as the
@@ -52,7 +52,7 @@ _ALL_OFF = b"\xfa\x00\x00\x00\x10"
 _WAKE = b"\x00\x20"
 _RESTART = b"\x00\xa0"
 
-# States of a chip. Up to _WAKING a state is the number of the transfer that comes next in setting it up.
+# States of a chip. From _RESET to _WAKING a state is the number of the transfer that comes next in setting it up.
 _UNUSED = const(0)
 _RESET = const(1)
 _WAKING = const(6)
@@ -212,32 +212,29 @@ class _Chip:
                 self._board.unlock(lock)
 
     def attend(self, now_us):
-        """Do the next step of setting up, or ask again for a chip that is gone."""
-        state = self.state
-        if state == _RUNNING:
-            if self._waits:
-                self.flush(self._registers, 0)
-        elif state == _GONE:
-            if ticks_diff(now_us, self._since_us) >= _PROBE_US:
-                self._attempts = 1
-                self.state = _RESET
-                self._set_up(now_us)
-        elif state != _UNUSED:
-            self._set_up(now_us)
-
-    def _set_up(self, now_us):
-        state = self.state
-        if state == _RESET:
+        """Set the chip up, ask for it again if it is gone, or send what waits."""
+        if self.state == _GONE and ticks_diff(now_us, self._since_us) >= _PROBE_US:
+            self._attempts = 1
+            self.state = _RESET
+        if self.state == _RESET:
             settings = self._settings
             self._address = settings[2]
             self._bus = self._board.i2c(settings[0], settings[1], 1000 * settings[4])
-        elif state == _WAKING and ticks_diff(now_us, self._since_us) < _WAKE_US:
-            return
-        if self._transfer(self._steps[state - 1]):
+            self._set_up(_WAKING)
+        elif self.state == _WAKING and ticks_diff(now_us, self._since_us) >= _WAKE_US:
+            self._set_up(_RUNNING)
+        if self.state == _RUNNING and self._waits:
+            self.flush(self._registers, 0)
+
+    def _set_up(self, until):
+        """Make the transfers of setting up that come before a state; stop at the first that fails."""
+        while self.state < until:
+            if not self._transfer(self._steps[self.state - 1]):
+                return
             self._attempts = 1 + _RETRIES
-            self._since_us = self._board.ticks_us()
-            self.state = state + 1
-            self._waits = True
+            self.state += 1
+        self._since_us = self._board.ticks_us()
+        self._waits = True
 
     def gone(self):
         """Return whether the chip does not answer."""
