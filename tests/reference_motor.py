@@ -249,6 +249,17 @@ def tapped(positions, period_us, frame_rate, frames):
     return numpy.array(values)
 
 
+def driven(speed, dead, top):
+    """Return a wheel's share of full drive, -1..1, at a speed of -1..1: `dead` is added from a 64th on, `top` is that at 1."""
+    size = abs(speed)
+    return math.copysign(dead * min(64 * size, 1) + (top - dead) * size, speed)
+
+
+def pulse_us(level, end0_us, end1_us):
+    """Return the pulse width at a level of 0..1; a wheel's drive of -1..1 is shifted and halved first."""
+    return end0_us + (end1_us - end0_us) * level
+
+
 def least_ticks(distance, speed, acceleration):
     """Return how many ticks a motion from rest to rest takes at least, as a real number; speeds are per tick."""
     if distance * acceleration >= speed * speed:

@@ -16,6 +16,7 @@ from tests.reference_motor import (
     characterised,
     characterised_spline,
     delay_s,
+    driven,
     exponential,
     first_tick_of_frame,
     knots_of_targets,
@@ -23,6 +24,7 @@ from tests.reference_motor import (
     least_ticks,
     place_of_tick,
     polynomials,
+    pulse_us,
     tapped,
     trajectory,
 )
@@ -297,3 +299,15 @@ def test_tap_of_a_parabola_is_off_by_an_eighth_of_its_bend():
 )
 def test_least_time_is_that_of_the_trapezoid_or_the_triangle(distance, speed, acceleration, ticks):
     assert least_ticks(distance, speed, acceleration) == ticks
+
+
+@pytest.mark.parametrize(
+    ("speed", "drive"),
+    [(0, 0), (1 / 128, 0.1025), (1 / 64, 0.205), (-1 / 64, -0.205), (0.5, 0.36), (1, 0.52), (-1, -0.52)],
+)
+def test_wheel_gets_its_dead_band_from_a_64th_on_and_ends_at_its_top_speed(speed, drive):
+    assert driven(speed, 0.2, 0.52) == pytest.approx(drive)
+
+
+def test_pulse_goes_from_end_to_end():
+    assert [pulse_us(level, 2000, 1000) for level in (0, 0.25, 1)] == [2000, 1750, 1000]
