@@ -4,10 +4,10 @@ import itertools
 
 import pytest
 
-from marotte.link import wire_packet
+from marotte.link import VirtualCarrier, wire_packet
 from marotte.mcu.unix import UnixMcu
 from shared import formats, messages
-from tests.link.stage import FRAME_US, begin_performance, pet_tables
+from tests.link.stage import ALL_TAPS, FRAME_US, Parts, begin_performance, open_session, pet_tables
 
 DOFS = len(pet_tables().puppet.dofs)
 LINK_TIMEOUT_US = 500_000
@@ -48,6 +48,102 @@ def test_telemetry_has_the_values_of_its_taps(session, taps):
     assert all(len(values) == DOFS * taps.bit_count() for _, _, values in session.taps)
     assert all(told == taps for _, told, _ in session.taps)
     assert bool(session.taps) == bool(taps)
+
+
+def told_by(session, name):
+    """Collect the messages of a name that the MCU sends from now on."""
+    told = []
+    forward = session.link._on_message
+
+    def on_message(message):
+        if message.name == name:
+            told.append(message)
+        forward(message)
+
+    session.link._on_message = on_message
+    return told
+
+
+def rated(frame_rate_hz, motor_period_us):
+    """The pet with another frame rate and another motor rate."""
+    parts = {"begin": {"frame_rate_hz": frame_rate_hz}, "robot": {"motor_period_us": motor_period_us}}
+    return Parts((name, fields | parts.get(name, {}), items) for name, fields, items in pet_tables().messages())
+
+
+@pytest.mark.parametrize("motor_period_us", [3008, 20000])
+@pytest.mark.parametrize("frame_rate_hz", [10, 30, 60])
+def test_taps_of_every_frame_come_once_soon_and_in_order(frame_rate_hz, motor_period_us):
+    """The course at a frame's instant is known one tick and a half later, and told with the frame after that."""
+    with UnixMcu() as mcu:
+        session = open_session(VirtualCarrier(mcu))
+        session.upload(rated(frame_rate_hz, motor_period_us))
+        session.telemetry(ALL_TAPS, 1, 0)
+        session.start()
+        session.flush()
+        frame_us = 1_000_000 / frame_rate_hz
+        late = []
+        for _ in range(400):
+            session.pump(5_000)
+            if session.taps:
+                late.append(session.status()["frame"] - 1 - session.taps[-1][0])
+        assert [frame for frame, _, _ in session.taps] == list(range(len(session.taps)))
+        assert len(session.taps) > 1.8e6 / frame_us
+        assert max(late) <= 1 + 1.5 * motor_period_us / frame_us + 5_000 / frame_us
+
+
+def test_derivatives_are_the_differences_of_the_targets(session):
+    """In a steady motion: `m = d + s / 2` (told doubled, Q16) and `s` (Q15) of the targets u, `d` their first difference."""
+    session.telemetry(ALL_TAPS | formats.TAP_DERIVATIVES, 1, 0)
+    frames_of(session, 100)
+    told = told_by(session, "derivatives")
+    frames_of(session, 60)
+    u = {frame: values[DOFS : 2 * DOFS] for frame, _, values in session.taps}
+    lags, moved = set(), 0
+    for message in told[5:-2]:
+        found = [(item["slope_q16"], item["bend_q15"]) for item in message.items]
+        for lag in range(4):
+            n = message.fields["frame"] - lag
+            three = list(zip(u[n - 2], u[n - 1], u[n], strict=True))
+            expected = [(2 * (c - b) + c - 2 * b + a, c - 2 * b + a) for a, b, c in three]
+            if found == expected:
+                lags.add(lag)
+                moved += any(slope for slope, _ in found)
+                break
+        else:
+            pytest.fail(f"frame {message.fields['frame']}: {found}")
+    assert len(told) > 50 and moved > 40
+    assert len(lags) == 1 and max(lags) <= 1, "the targets that have taken effect"
+
+
+def test_derivatives_come_as_often_as_taps_and_do_not_need_them(session):
+    told = told_by(session, "derivatives")
+    session.telemetry(formats.TAP_DERIVATIVES, 3, 0)
+    assert frames_of(session, 30) == []
+    frames = [message.fields["frame"] for message in told]
+    assert len(frames) == pytest.approx(10, abs=1) and {frame % 3 for frame in frames} == {0}
+    assert all(len(message.items) == DOFS for message in told)
+    told.clear()
+    session.telemetry(ALL_TAPS, 1, 0)
+    assert len(frames_of(session, 10)) >= 9 and told == []
+
+
+def test_status_is_followed_by_that_of_the_motor_layer(session):
+    ticks = [session.status()["ticks"]]
+    frames_of(session, 60)
+    status = session.status()
+    ticks.append(status["ticks"])
+    assert ticks[1] - ticks[0] == pytest.approx(2_000_000 / 20_000, abs=2)
+    assert (status["attached"], status["released"], status["stalled"], status["killed_by"]) == (0, 0, 0, 0)
+    assert (status["bus_errors"], status["bus_gone"], status["resets"]) == (0, 0, 0)
+    assert (status["late_frames"], status["tick_max_us"], status["tick_late_max_us"]) == (0, 0, 0), "no time passes"
+    assert status["store"] == formats.STORE_NONE
+    session.arm()
+    frames_of(session, 60)
+    outputs = sum(name == "output" for name, _, _ in pet_tables().messages())
+    assert session.status()["attached"].bit_count() == outputs
+    session.kill()
+    status = session.status()
+    assert (status["armed"], status["attached"], status["killed_by"]) == (0, 0, formats.KILLED_BY_HOST)
 
 
 def test_telemetry_tells_the_weights_of_what_plays(session):
