@@ -123,10 +123,11 @@ class Board(VirtualTime):
 
     def adc_start(self, pin):
         """Measure the voltage at a pin."""
-        self._adc_q15 = self._analog_q12[pin] << 3
+        level_q12 = self._analog_q12[pin]
+        self._adc_q15 = (level_q12 << 3) + ((level_q12 + 256) >> 9)
 
     def adc_read(self):
-        """Return what was measured, 32768 being the supply."""
+        """Return what was measured last, 32768 being the supply; the converter's 4095 is that."""
         return self._adc_q15
 
     def i2c(self, sda, scl, baud_hz):

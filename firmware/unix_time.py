@@ -94,15 +94,8 @@ class VirtualTime:
                 left_us -= self._advance(left_us)
 
     def start_ticks(self, period_us, handler):
-        """Call `handler` each `period_us` from now on, the first time in one period.
-
-        If ticks are under way, the new period counts from the last one, and a tick that it would have had is left out.
-        """
-        if self._tick_at < 0:
-            last_us = self._offset_us
-        else:
-            last_us = self._tick_at - self._period_us
-        self._tick_at = last_us + ((self._offset_us - last_us) // period_us + 1) * period_us
+        """Call `handler` each `period_us` from now on, the first time in one period."""
+        self._tick_at = self._offset_us + period_us
         self._period_us = period_us
         self._handler = handler
 

@@ -14,7 +14,7 @@ Q18_BITS = 18
 SLICES = 8
 _WRITE = struct.Struct("<BI")
 _LOW, _HIGH, _ATTACH = -1, -2, -3
-"""In the log of a pin, where anything from 0 up is an on-time; from _ATTACH down are places in the list of phases."""
+"""In the log of a pin, where anything from 0 up is an on-time; from _ATTACH down are places in the list of attachments."""
 
 
 class Drive(NamedTuple):
@@ -34,14 +34,21 @@ class Pins:
 
     def __init__(self) -> None:
         self._pins: dict[int, _Pin] = {}
+        self._sliced: list[set[int]] = [set() for _ in range(SLICES)]  # pins with pulses since the slice was started
 
     def attach(self, at_us: int, pin: int, period_us: int, until_wrap_us: int) -> None:
-        """Give a pin to its PWM slice. The slice begins to count now, unless its other pins keep it running."""
+        """Give a pin to its PWM slice. The slice begins to count now, unless its other pins keep it running: then a pin that
+        has had pulses from it before gets the next ones with the second write, when its old ones are certainly gone.
+        """
         phase = _Phase(period_us * 1000, (at_us + until_wrap_us) * 1000)
-        for number, other in self._pins.items():
-            if other.pwm and number != pin and (number >> 1) % SLICES == (pin >> 1) % SLICES:
-                phase = other.phase
-        self._pin(pin).attach(at_us, phase)
+        number = (pin >> 1) % SLICES
+        others = [other for name, other in self._pins.items() if (name >> 1) % SLICES == number and name != pin]
+        running = [other.phase for other in others if other.pwm and other.phase.period_ns == phase.period_ns]
+        if not running:
+            self._sliced[number] = set()
+        model = self._pins.setdefault(pin, _Pin())
+        model.attach(at_us, running[0] if running else phase, pin in self._sliced[number])
+        self._sliced[number].add(pin)
 
     def write(self, at_us: int, data: bytes) -> None:
         """Set on-times from the next period on: pin u8, pulse_q18us u32, repeated. A pin without PWM stays as it is."""
@@ -54,7 +61,7 @@ class Pins:
 
     def drive(self, at_us: int, pin: int, level: int) -> None:
         """Drive a pin to a level, whatever it was before."""
-        self._pin(pin).drive(at_us, level)
+        self._pins.setdefault(pin, _Pin()).drive(at_us, level)
 
     def quiet(self, at_us: int) -> None:
         """Drive all pins low that have PWM."""
@@ -91,9 +98,6 @@ class Pins:
         for model in self._pins.values():
             model.forget(end_us)
 
-    def _pin(self, pin: int) -> _Pin:
-        return self._pins.setdefault(pin, _Pin())
-
 
 class _Pin:
     """One pin: the log of what was done to it, and how far that has been turned into edges."""
@@ -103,7 +107,7 @@ class _Pin:
         self.phase = _Phase(0, 0)
         self.log_us = array("q")
         self.log = array("q")
-        self._phases: list[_Phase] = []
+        self._attached: list[tuple[_Phase, bool]] = []  # whether the first write only clears
         self._done = 0  # entries of the log that have become edges
         self._edges: list[tuple[int, int]] = []
         self._level = 0
@@ -111,13 +115,14 @@ class _Pin:
         self._wrap_ns = 0
         self._fall_ns = -1  # when the pulse under way ends, -1 if it does not
         self._width_ns = 0
+        self._clears = False
 
-    def attach(self, at_us: int, phase: _Phase) -> None:
+    def attach(self, at_us: int, phase: _Phase, clears: bool) -> None:
         self.pwm = True
         self.phase = phase
         self.log_us.append(at_us)
-        self.log.append(_ATTACH - len(self._phases))
-        self._phases.append(phase)
+        self.log.append(_ATTACH - len(self._attached))
+        self._attached.append((phase, clears))
 
     def drive(self, at_us: int, level: int) -> None:
         self.pwm = False
@@ -132,7 +137,7 @@ class _Pin:
 
     def forget(self, end_us: int) -> None:
         self.edges_until(end_us)
-        del self.log_us[:], self.log[:], self._phases[:]
+        del self.log_us[:], self.log[:], self._attached[:]
         self._done = 0
 
     def edges_until(self, end_us: int) -> list[tuple[int, int]]:
@@ -141,13 +146,15 @@ class _Pin:
             at_ns = self.log_us[place] * 1000
             self._advance(at_ns)
             entry = self.log[place]
-            if entry >= 0:
+            if entry >= 0 and self._clears:
+                self._clears = False
+            elif entry >= 0:
                 self._width_ns = entry * 1000 + (1 << Q18_BITS >> 1) >> Q18_BITS
             elif entry > _ATTACH:
                 self._period_ns = 0
                 self._turn(at_ns, 1 if entry == _HIGH else 0)
             else:
-                phase = self._phases[_ATTACH - entry]
+                phase, self._clears = self._attached[_ATTACH - entry]
                 self._period_ns = phase.period_ns
                 self._wrap_ns = at_ns + 1 + (phase.wrap_ns - at_ns - 1) % phase.period_ns
                 self._width_ns = 0
