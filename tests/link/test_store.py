@@ -6,9 +6,12 @@ import zlib
 
 import pytest
 
-from marotte.link import pack
+from marotte.link import LinkRefused, VirtualCarrier, pack
+from marotte.mcu.unix import UnixMcu
+from marotte.session import Session
 from shared import codec, formats, messages
 from tests.checked import load_checked
+from tests.link.stage import FRAME_US, WARM_UP_US, Parts, open_session, pet_tables
 
 STORE = load_checked("firmware/store.py")
 COMMANDS = load_checked("firmware/commands.py")
@@ -449,3 +452,109 @@ def test_failure_of_the_flash_is_told_and_leaves_the_old_file(failing):
     assert mcu.save(CONTENT) == []
     flash.failing = "remove"
     assert mcu.do("save_erase") == (messages.FLASH, 28)
+
+
+# --- on the MCUs, through the link
+
+AUTOSTART_US = 3_000_000
+"""After so long the pet's outputs are attached, one after the other."""
+
+
+@pytest.fixture(params=["unix", pytest.param("rp2040", marks=pytest.mark.images)])
+def switch_on(request, tmp_path):
+    """Makes MCUs that have one flash, one after the other: each finds what those before have kept."""
+    if request.param == "unix":
+        return lambda: UnixMcu(folder=tmp_path)
+    make = request.getfixturevalue("rp2040_mcu")
+    return lambda: make(flash=tmp_path / "flash.bin")
+
+
+def keep(session, tables):
+    """Let the MCU keep tables, a behaviour and a start."""
+    content = b"".join(record(*part) for part in tables.messages())
+    targets = [{"action": 0, "target_q28": formats.WEIGHT_ONE}, {"action": 2, "target_q28": formats.WEIGHT_ONE // 2}]
+    content += record("weight_targets", {"frame": 0}, targets) + START
+    session.link.post("save_begin", {"bytes": len(content), "crc32": zlib.crc32(content)})
+    for place in range(0, len(content), STEP):
+        session.link.post("save", {"place": place}, piece(content[place : place + STEP]))
+    session.link.post("save_end", {})
+    session.flush(20)
+    return targets
+
+
+def taps_of(session, frames):
+    """Ask for base and signal; return them by frame, when so many have come."""
+    session.telemetry(formats.TAP_BASE | formats.TAP_SIGNAL, 1, 0)
+    while len(session.taps) < frames:
+        session.pump(FRAME_US)
+    return {frame: values for frame, _, values in session.taps}
+
+
+def pet_that_starts_by_itself():
+    parts = pet_tables().messages()
+    return Parts((name, fields | ({"autostart": 1} if name == "robot" else {}), items) for name, fields, items in parts)
+
+
+def test_mcu_plays_what_it_has_kept_when_it_is_switched_on(switch_on):
+    with switch_on() as mcu:
+        session = open_session(VirtualCarrier(mcu))
+        targets = keep(session, pet_tables())
+        assert session.status()["frame"] == -1, "what is kept does not play at once"
+        session.upload(pet_tables())
+        session.weight_targets(0, {target["action"]: target["target_q28"] for target in targets})
+        session.start()
+        wanted = taps_of(session, 90)
+    with switch_on() as mcu:
+        session = open_session(VirtualCarrier(mcu))
+        assert session.welcome["frame"] >= 0 and not session.welcome["armed"]
+        found = taps_of(session, 30)
+        status = session.status()
+        assert status["store"] == formats.STORE_PLAYED and status["attached"] == 0
+    common = wanted.keys() & found.keys()
+    assert len(common) > 20
+    assert all(wanted[frame] == found[frame] for frame in common)
+
+
+def test_mcu_arms_itself_when_it_is_switched_on_if_the_robot_says_so(switch_on):
+    with switch_on() as mcu:
+        session = open_session(VirtualCarrier(mcu))
+        keep(session, pet_that_starts_by_itself())
+        session.upload(pet_that_starts_by_itself())
+        assert not session.status()["armed"]
+    with switch_on() as mcu:
+        mcu.run_for(AUTOSTART_US)
+        outputs = [part for part in pet_tables().messages() if part[0] == "output"]
+        assert all(mcu.edges(items[0]["setting"]) for _, _, items in outputs)
+        session = Session(VirtualCarrier(mcu))
+        session.open()
+        status = session.status()
+        assert status["armed"] and status["attached"].bit_count() == len(outputs)
+        for name in ("save_begin", "save_erase"):
+            with pytest.raises(LinkRefused, match="not possible in this state"):
+                session.link.post(name, {"bytes": 1, "crc32": 0} if name == "save_begin" else {})
+                session.flush()
+        session.kill()
+        session.stop()
+        session.link.post("save_erase", {})
+        session.flush(5)
+    with switch_on() as mcu:
+        mcu.run_for(WARM_UP_US)
+        session = open_session(VirtualCarrier(mcu))
+        assert session.welcome["frame"] == -1
+        assert session.status()["store"] == formats.STORE_NONE
+
+
+def test_mcu_ignores_a_damaged_file_and_tells(tmp_path):
+    with UnixMcu(folder=tmp_path) as mcu:
+        keep(open_session(VirtualCarrier(mcu)), pet_that_starts_by_itself())
+    file = tmp_path / STORE.NAME
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+    with UnixMcu(folder=tmp_path) as mcu:
+        session = open_session(VirtualCarrier(mcu))
+        assert session.welcome["frame"] == -1 and not session.welcome["armed"]
+        assert session.status()["store"] == formats.STORE_DAMAGED
+        session.upload(pet_tables())
+        session.start()
+        session.flush()
