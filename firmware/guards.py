@@ -29,9 +29,11 @@ _ZERO = const(0x10000000)
 _HALF = const(0x800000)  # a relative DOF at 0
 _SLOT_US = const(10000)
 _SLOT_MAX_MS = const(30000)
+_EARLY_US = const(1000)  # a turn to attach may come so much early: a main loop that wakes with the motor ticks jitters
 _STANDS_MS = const(100)
 _NEAR_Q24 = const(0x8000)  # 1/512
 _AWAY_Q24 = const(0x10000)  # 1/256
+_CHANGE_Q24 = const(0x1000)  # 1/4096
 _AT_ZERO_Q24 = const(0x1000)  # 1/2048 of a relative DOF's top speed
 _USED_MAX_MS = const(0x10000000)
 
@@ -47,12 +49,13 @@ _ATTACH = const(4)
 def _watch(
     position_q24: ptr32, velocity_q24: ptr32, reference_q24: ptr32, low_q24: ptr32, high_q24: ptr32, relative: ptr8,
     dofs: int, masks: ptr32, elapsed_ms: int, slow_q24: int, relaxing: int, release_ms: ptr16, duty_q15: ptr16,
-    budget_ms: ptr32, used_ms: ptr32, used_q15: ptr32, still_ms: ptr32,
+    budget_ms: ptr32, used_ms: ptr32, used_q15: ptr32, still_ms: ptr32, seen_q24: ptr32,
 ):  # fmt: skip
     """Go on counting for `elapsed_ms`, 0..30000; set which DOFs are to be released and attached in `masks`.
 
     `still_ms` is 1 more than the time for which a DOF has stood, 0 while it does not. The bucket holds `used_ms +
-    used_q15 / 2^15`, exactly. Velocity and reference have 16 added.
+    used_q15 / 2^15`, exactly. Velocity and reference have 16 added. `seen_q24` is where the DOFs were the last time: a short move
+    in between ends a stand too.
     Bits: what flows into the bucket is below 30000 * 2^15 < 2^30; the bucket ends at 2^28 ms.
     """
     attached = masks[_ATTACHED]
@@ -91,8 +94,10 @@ def _watch(
         away = position - goal
         if away < 0:
             away = -away
+        change = position - seen_q24[d]
+        seen_q24[d] = position
         still = 0
-        if attached & bit:
+        if attached & bit and -_CHANGE_Q24 <= change and change <= _CHANGE_Q24:
             if away <= _NEAR_Q24 and -slow_q24 <= velocity and velocity <= slow_q24:
                 off = position - _HALF if relative[d] else 0
                 if -_AT_ZERO_Q24 <= off and off <= _AT_ZERO_Q24:
@@ -104,7 +109,7 @@ def _watch(
                 most = int(release_ms[d])
                 if relaxing or spent & bit or (most and still > most):
                     release = release | bit
-        elif away > _AWAY_Q24 and wanted & bit and (spent & bit) == 0:
+        if away > _AWAY_Q24 and wanted & bit and ((attached | spent) & bit) == 0:
             attach = attach | bit
         still_ms[d] = still
         d += 1
@@ -138,6 +143,7 @@ class Guards:
         self._used_ms = words(DOFS_MAX)
         self._used_q15 = words(DOFS_MAX)
         self._still_ms = words(DOFS_MAX)
+        self._seen_q24 = words(DOFS_MAX)
 
     @property
     def released(self):
@@ -204,7 +210,9 @@ class Guards:
             self._relaxing = relaxing
             if not relaxing:
                 self._queue(now_us)
-        motor, masks, tables = self._motor, self._masks, self._motor.tables
+        motor = self._motor
+        masks = self._masks
+        tables = motor.tables
         attached = motor.attached
         stalled = motor.feedback.stalled & attached & self.armed
         if stalled:
@@ -218,6 +226,7 @@ class Guards:
             motor.position_q24, motor.velocity_q24, motor.reference_q24, tables.limit_low_q24, tables.limit_high_q24,
             tables.relative, tables.dofs, masks, elapsed_ms, self._slow_q24, 1 if relaxing else 0, tables.release_ms,
             tables.duty_q15, self._budget_ms, self._used_ms, self._used_q15, self._still_ms,
+            self._seen_q24,
         )
         # fmt: on
         if masks[_RELEASE]:
@@ -249,7 +258,7 @@ class Guards:
         self._next_us = now_us
 
     def _attach_next(self, now_us):
-        while self._pending and ticks_diff(now_us, self._next_us) >= 0:
+        while self._pending and ticks_diff(now_us, self._next_us) >= -_EARLY_US:
             bit = self._pending & -self._pending
             self._pending ^= bit
             self._attach(bit)

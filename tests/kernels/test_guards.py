@@ -25,15 +25,15 @@ ONE, HALF, ZERO = 1 << 24, 1 << 23, 1 << 28
 WRAP = 1 << 30
 NO_DRIVER = NEW = 255
 SLOT_S, STANDS_S = 0.010, 0.100
-SLOW, NEAR, AWAY = 1 / 1024, 1 / 512, 1 / 256
+NEAR, AWAY, UNSEEN = 1 / 512, 1 / 256, 1 / 2048
 
 
 class Motor:
     """DOFs that glide to their references at a constant speed while they have pulses.
 
     A DOF is a dict: `relative`, `has_output`, `release_ms`, `duty` with `window_s`, `speed` (per second).
-    `log` has (instant in seconds, "attach" or "detach", DOF); `moved` per DOF when it was last faster than 1/1024 or farther
-    than 1/512 from its reference.
+    `log` has (instant in seconds, "attach" or "detach", DOF); `moved_s` per DOF when it had last moved by
+    more than 1/2048, or was farther than 1/512 from its reference.
     """
 
     def __init__(self, *dofs, attach_ms=100, period_us=20000, begin_us=0, pass_us=3000):
@@ -49,6 +49,7 @@ class Motor:
         self.reference_q24 = words([HALF + ZERO] * 16)
         self.feedback = SimpleNamespace(stalled=0, forgive=self._forgive)
         self.log, self.moved_s = [], [0.0] * 16
+        self.stood_q24 = [HALF] * 16
         self.had_pulses_s = [0.0] * 16
         self.board = SimpleNamespace(ticks_us=self.ticks_us, lock=lambda: 7, unlock=lambda state: None)
         self.guards = MODULE.Guards(self, self.board)
@@ -104,8 +105,9 @@ class Motor:
             moved = max(-step, min(off, step)) if self.attached >> dof & 1 else 0
             self.position_q24[dof] += moved
             self.velocity_q24[dof] = moved + ZERO
-            if abs(moved) * 1e6 / self.period_us / ONE > SLOW or abs(off - moved) / ONE > NEAR:
+            if abs(off - moved) / ONE > NEAR or abs(self.position_q24[dof] - self.stood_q24[dof]) / ONE > UNSEEN:
                 self.moved_s[dof] = self.now_s
+                self.stood_q24[dof] = self.position_q24[dof]
 
     def events(self, dof=None):
         return [(round(at, 3), what) for at, what, of in self.log if of == dof]
@@ -141,7 +143,7 @@ DUTIES = integers(1, 32767, 16384)
 def test_bucket_is_exact(steps, duty_q15, window_s):
     duty = Fraction(duty_q15, 32768)
     budget = max(1, int(duty * (1 - duty) * window_s * 1000))
-    used_ms, used_q15, still, masks = words([0]), words([0]), words([0]), words([0] * 5)
+    used_ms, used_q15, still, seen, masks = words([0]), words([0]), words([0]), words([HALF]), words([0] * 5)
     level, spent = Fraction(0), False
     for elapsed, attached in steps:
         masks[0] = 1 if attached else 0
@@ -160,6 +162,7 @@ def test_bucket_is_exact(steps, duty_q15, window_s):
             used_ms,
             used_q15,
             still,
+            seen,
         )
         level = max(Fraction(0), level + (elapsed * (1 - duty) if attached else -elapsed * duty))
         assert used_ms[0] + Fraction(used_q15[0], 32768) == level
@@ -180,16 +183,23 @@ def test_bucket_is_exact(steps, duty_q15, window_s):
     integers(0, 1 << 16, 1, 91, 101),
     integers(0, 65535, 100),
     st.booleans(),
+    integers(-ONE, ONE, 0, 4096, 4097, -4096, -4097),
 )
-@example(HALF, 0, HALF, True, True, 95, 0, True)
-def test_dof_stands_where_it_should(position, velocity, reference, relative, attached, before, release_ms, relaxing):
+@example(HALF, 0, HALF, True, True, 95, 0, True, 0)
+def test_dof_stands_where_it_should(
+    position, velocity, reference, relative, attached, before, release_ms, relaxing, change
+):
     still, masks = words([before]), words([1 if attached else 0, 1, 0, 0, 0])
-    low, high = ONE // 8, ONE - ONE // 8
+    low, high, seen = ONE // 8, ONE - ONE // 8, words([position - change])
     arrays = words([position]), words([velocity + ZERO]), words([reference + ZERO]), words([low]), words([high])
     full = halves([32768]), words([0]), words([0]), words([0])
-    MODULE._watch(*arrays, bytes([relative]), 1, masks, 10, 327, int(relaxing), halves([release_ms]), *full, still)
+    MODULE._watch(
+        *arrays, bytes([relative]), 1, masks, 10, 327, int(relaxing), halves([release_ms]), *full, still, seen
+    )
     off = abs(min(max(reference, low), high) - position) / ONE
-    stands = attached and off <= NEAR and abs(velocity) <= 327 and (not relative or abs(position - HALF) <= ONE >> 12)
+    stands = attached and off <= NEAR and abs(velocity) <= 327 and abs(change) <= ONE >> 12
+    stands = stands and (not relative or abs(position - HALF) <= ONE >> 12)
+    assert seen[0] == position
     assert still[0] == ((min(before + 10, 1 << 16) if before else 1) if stands else 0)
     stood_ms = still[0] - 1
     assert masks[3] == (stands and stood_ms >= 100 and (relaxing or 0 < release_ms <= stood_ms))
@@ -210,7 +220,7 @@ def test_dofs_attach_one_after_the_other(begin_us, attach_ms):
     motor.run(4 * attach_ms * 1e-3 + 0.05)
     assert [dof for _, _, dof in motor.log] == [0, 2, 3, 4]
     instants = [at for at, _, _ in motor.log]
-    assert instants == pytest.approx([0.1 + n * attach_ms * 1e-3 for n in range(4)], abs=1e-6)
+    assert instants == pytest.approx([0.1 + n * attach_ms * 1e-3 for n in range(4)], abs=0.0031)
     assert (motor.guards.armed, motor.guards.released) == (0b11101, 0)
 
 
@@ -219,7 +229,18 @@ def test_dofs_never_attach_closer_than_said_however_slow_the_main_loop():
     motor.arm()
     motor.run(1)
     instants = [at for at, _, _ in motor.log]
-    assert all(0.050 <= after - at <= 0.087 for at, after in pairwise(instants))
+    assert all(0.049 <= after - at <= 0.087 for at, after in pairwise(instants))
+
+
+def test_jitter_of_the_main_loop_does_not_make_an_attachment_miss_its_turn():
+    motor = Motor({}, {}, {}, {}, attach_ms=100, pass_us=20_000)
+    motor.arm()
+    draw = random.Random(1)
+    begin_us = motor.now_us
+    for n in range(1, 20):
+        motor.now_us = begin_us + 20_000 * n + draw.randint(-300, 300)
+        motor.guards.attend(motor.ticks_us(), False)
+    assert [at for at, _, _ in motor.log] == pytest.approx([0.0, 0.1, 0.2, 0.3], abs=3.1e-4)
 
 
 def test_disarming_ends_the_sequence_and_every_return():
@@ -293,7 +314,7 @@ MOVES = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(MOVES, st.sampled_from([20000, 3008]), st.sampled_from([1000, 3000, 14000]), st.sampled_from([0.2, 1.0, 5.0]))
 def test_dof_is_never_let_go_in_mid_move(moves, period_us, pass_us, speed):
     dofs = [
@@ -311,7 +332,6 @@ def test_dof_is_never_let_go_in_mid_move(moves, period_us, pass_us, speed):
             nonlocal seen
             for at, what, of in motor.log[seen:]:
                 if what == "detach":
-                    # positions are looked at each 10 ms or each pass, so a tick's end may be seen as much later
                     assert at - motor.moved_s[of] >= STANDS_S - 1e-6
                     assert of != 1 or abs(motor.position_q24[1] - HALF) <= ONE >> 12
             seen = len(motor.log)
