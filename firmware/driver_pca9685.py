@@ -4,8 +4,8 @@ Settings of a device: `sda, scl, address, oe, baud_khz, clock_khz`; of an output
 of the DOF's turn among the motor ticks, to what the chip's divider can do; a pulse is a multiple of its 4096th part (4.9 us at
 50 Hz), which is all that the chip resolves.
 
-I2C takes its time and may fail, so a chip is set up and written from the main loop (`flush`), soon after the tick: all channels in use in
-one burst, which the chip takes over together, at the STOP, each channel at the end of its period (data sheet, 7.3.3).
+I2C takes its time and may fail, so a chip is set up and written from the main loop (`flush`), soon after the tick: all
+channels in use in one burst, which takes effect at its STOP, for each channel at the end of its period (data sheet, 7.3.3).
 A transfer that fails is repeated at once, twice; then the device counts as gone. It is asked for again every 500 ms, and set up
 anew when it answers: its channels start with the present values. A stuck bus holds the main loop up for as long as the
 longest burst takes, and again with every question.
