@@ -3,6 +3,7 @@
 import random
 import struct
 import zlib
+from pathlib import Path
 
 import pytest
 
@@ -18,6 +19,7 @@ COMMANDS = load_checked("firmware/commands.py")
 TABLES = load_checked("firmware/tables.py")
 CUES = load_checked("firmware/cues.py")
 
+CHECKOUT = Path(__file__).parents[2]
 STEP = codec.PAYLOAD_MAX - 4
 """Bytes of a file in one `save`."""
 
@@ -229,6 +231,10 @@ def as_file(content):
 
 def with_autostart(content=CONTENT):
     return content.replace(record("robot", ROBOT), record("robot", ROBOT | {"autostart": 1}))
+
+
+def test_example_of_the_documentation_is_right():
+    assert record("robot", ROBOT).hex(" ") in (CHECKOUT / "docs" / "link.md").read_text("utf-8")
 
 
 def test_file_is_kept_and_played():
