@@ -265,7 +265,7 @@ class Feedback:
             settings[s + _AT0_Q15] = at0_q15
             settings[s + _AT1_Q15] = at1_q15
             settings[s + _SCALE] = ((1 << 30) // span + 1 >> 1) + _ZERO
-            settings[s + _LOW_Q15] = least - (abs(span) >> 2)
+            settings[s + _LOW_Q15] = max(0, least - (abs(span) >> 2))
             settings[s + _HIGH_Q15] = most + (abs(span) >> 2)
             settings[s + _LEAST_Q15] = _PLAUSIBLE_Q15 if least >= _PLAUSIBLE_Q15 else 0
             settings[s + _MOST_Q15] = 32768 - _PLAUSIBLE_Q15 if most <= 32768 - _PLAUSIBLE_Q15 else 32768

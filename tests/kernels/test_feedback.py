@@ -72,6 +72,8 @@ class Loop:
                 command = max(self.low, min(reference + correction, self.high))
                 self.position_q24[dof] = round(command * ONE)
         self.feedback.tick(self.attached, self.position_q24, self.correction_q24)
+        for stored in (self.feedback._settings, self.feedback._state, self.feedback._masks, self.correction_q24):
+            assert min(stored) >= 0  # a 64-bit port reads words without their sign
         for dof, servo in enumerate(self.servos):
             servo.run(self.period_s, self.position_q24[dof] / ONE if self.attached >> dof & 1 else None)
 
@@ -106,7 +108,7 @@ def channels(draw):
     least, most, margin = min(at0, at1), max(at0, at1), abs(at1 - at0) >> 2
     limit_q15 = draw(integers(0, 32768))
     stall_q24 = draw(st.sampled_from([1 << 27]) | integers(1, 32768).map(lambda q15: q15 << 9))
-    settings = [3, at0, scaled(at0, at1), least - margin, most + margin]
+    settings = [3, at0, scaled(at0, at1), max(0, least - margin), most + margin]
     settings += [512 if least >= 512 else 0, 32256 if most <= 32256 else 32768]
     settings += [draw(integers(0, 32768)), draw(integers(0, ONE)), limit_q15 << 9, stall_q24]
     settings += [draw(integers(1, 65535)), draw(st.integers(1, 3)), draw(st.integers(0, 32768)), PIN, at1]

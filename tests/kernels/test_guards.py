@@ -94,6 +94,8 @@ class Motor:
             if each_pass:
                 each_pass()
             self.guards.attend(self.ticks_us(), relaxing)
+            for stored in (self.guards._masks, self.guards._used_ms, self.guards._used_q15, self.guards._still_ms):
+                assert min(stored) >= 0  # a 64-bit port reads words without their sign
             for dof in range(len(self.dofs)):
                 self.had_pulses_s[dof] += self.pass_us * 1e-6 * (self.attached >> dof & 1)
 
