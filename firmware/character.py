@@ -114,11 +114,15 @@ class Character:
             gather_words(values, keep, scratch, dofs, _ZERO, 0)
 
     def load(self, tables):
-        """Take over which DOFs have a character, and its coefficients."""
-        for d in range(tables.dofs):
-            self._used[d] = tables.has_character[d]
-        for place in range(_TERMS * tables.dofs):
-            self._coefficient_q24[place] = tables.response_q24[place] + _ZERO
+        """Take over which DOFs have a character, and its coefficients; a tick may come in between. Allocates."""
+        used = bytearray(tables.has_character)
+        coefficient_q24 = words(_TERMS * DOFS_MAX)
+        for dof in range(tables.dofs):
+            if used[dof]:
+                for place in range(_TERMS * dof, _TERMS * (dof + 1)):
+                    coefficient_q24[place] = tables.response_q24[place] + _ZERO
+        self._coefficient_q24 = coefficient_q24
+        self._used = used
 
     def respond(self, dofs, input_q24):
         """Take the step of one tick towards the input, which is Q24 with 16 added."""

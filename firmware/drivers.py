@@ -23,7 +23,7 @@ class Drivers:
     def __init__(self, board):
         self._board = board
         self._drivers = [kind(board) for kind in _KINDS]
-        self._in_tick = [driver for driver in self._drivers if driver.in_tick]
+        self._writing = tuple(self._drivers)  # those that write in the tick and have outputs
         self._later = [driver for driver in self._drivers if not driver.in_tick]
         self._driver = bytearray([NO_DRIVER] * DOFS_MAX)
 
@@ -122,6 +122,8 @@ class Drivers:
             kept |= driver.load(tables)
         for dof in range(DOFS_MAX):
             self._driver[dof] = tables.driver[dof] if dof < tables.dofs else NO_DRIVER
+        used = set(self._driver)
+        self._writing = tuple(driver for code, driver in enumerate(self._drivers) if driver.in_tick and code in used)
         return kept
 
     def attach(self, dof, until_us):
@@ -141,7 +143,7 @@ class Drivers:
 
         `level_q24` is the calibrated level, 0x800000 standing still, `pulse_q18us` the pulse width, both by DOF.
         """
-        for driver in self._in_tick:
+        for driver in self._writing:
             driver.write(level_q24, pulse_q18us, due)
 
     def flush(self, level_q24, pulse_q18us, due):

@@ -41,6 +41,7 @@ _CALM_PER_S = const(4)  # change of a wheel's speed when it has to stand: from f
 _GLIDE_US_PER_S = const(200)  # of pulse ends that are set anew
 _AHEAD_US = const(2000)  # a start that is nearer to the next tick takes the one after it
 _STOPPED_US = const(100000)  # without a tick for so long, the main loop takes the pulses away
+_UNKNOWN_US = const(-1)
 _KEEP_US = const(16000)  # between two notes of the pose
 
 
@@ -52,6 +53,24 @@ def _remember(position_q24: ptr32, before_q24: ptr32, dofs: int):
         before_q24[_DOFS + d] = before_q24[d]
         before_q24[d] = position_q24[d]
         d += 1
+
+
+@micropython.viper
+def _measure(times_us: ptr32, period_us: int, begun_us: int, ended_us: int):
+    """Keep the longest tick (word 0) and the largest lateness of one against the first (1); word 2 is when it was expected.
+
+    Microseconds count modulo 2^30; a word 2 outside of that means that this tick is the first.
+    """
+    expected = times_us[2]
+    if expected < 0 or expected > 0x3FFFFFFF:
+        expected = begun_us
+    late = (begun_us - expected) & 0x3FFFFFFF
+    if late < 0x20000000 and late > times_us[1]:
+        times_us[1] = late
+    took = (ended_us - begun_us) & 0x3FFFFFFF
+    if took > times_us[0]:
+        times_us[0] = took
+    times_us[2] = (expected + period_us) & 0x3FFFFFFF
 
 
 class Motor:
@@ -70,8 +89,6 @@ class Motor:
         self.silent = True
         self.playing = False
         self.ticks = 0
-        self.tick_max_us = 0
-        self.tick_late_max_us = 0
         self.tables = tables
         self.position_q24 = words(DOFS_MAX)
         self.velocity_q24 = words(DOFS_MAX)
@@ -96,7 +113,9 @@ class Motor:
         self._turn = bytearray(DOFS_MAX)
         self._rest_q15 = None
         self._period_us = 0
-        self._step = 0
+        self._part = 0  # of a frame in a tick, in millionths
+        self._paused = False
+        self._missed = 0
         self._calm_q24 = 0
         self._glide_q4us = 0
         self._timeout_ticks = 0
@@ -106,7 +125,8 @@ class Motor:
         self._starting = 0
         self._tap_part = 0
         self._later = 0
-        self._expected_us = -1
+        self._times_us = words(3)
+        self._times_us[2] = _UNKNOWN_US
         self._since = 0  # ticks at which the turns began
         self._seen = 0
         self._seen_us = board.ticks_us()
@@ -122,6 +142,16 @@ class Motor:
         return self.trajectory.late
 
     @property
+    def tick_max_us(self):
+        """Return how long a tick took at most, since `start`."""
+        return self._times_us[0]
+
+    @property
+    def tick_late_max_us(self):
+        """Return how late a tick came at most against the first, since `start`."""
+        return self._times_us[1]
+
+    @property
     def released(self):
         """Return a mask of the armed DOFs that a guard has taken the pulses from."""
         return self.guards.released
@@ -133,74 +163,85 @@ class Motor:
 
     def load(self, tables):
         """Take over a puppet's tables while nothing moves: all outputs fall silent, each DOF is at its last known pose."""
+        board = self._board
         self.kill(self.killed_by)
-        state = self._board.lock()
+        board.stop_ticks()
         self.playing = False
         self._starting = 0
         self.tables = tables
         for d in range(tables.dofs):
             self.position_q24[d] = tables.rest_q15[d] << 9
-        self._board.kept_pose(tables.dofs, self.position_q24, _tag(tables))
+        board.kept_pose(tables.dofs, self.position_q24, _tag(tables))
         for d in range(tables.dofs):
             if tables.driver[d] == NO_DRIVER:
                 self.position_q24[d] = tables.rest_q15[d] << 9
             elif tables.relative[d]:
                 self.position_q24[d] = _STILL_Q24
             self._turn[d] = 0
-            self._end_q4us[d] = tables.end0_q4us[d]
-            self._end_q4us[_DOFS + d] = tables.end1_q4us[d]
+            self._take_ends(d)
             self._stand(d)
         self._hold_unattached()
         self._drivers.load(tables)
-        self._take_over(tables)
         self._set_rates(tables)
+        self.trajectory.load(tables)
         self.trajectory.hold(tables.dofs, self.position_q24)
+        self._take_over(tables)
         self._since = self.ticks
-        self._board.start_ticks(tables.motor_period_us, self.tick)
-        self._expected_us = -1
-        self._board.unlock(state)
+        self._times_us[2] = _UNKNOWN_US
+        board.start_ticks(tables.motor_period_us, self.tick)
 
     def exchange(self, tables, gather_words, gather_halves, scratch):
         """Take over other tables while the motion goes on; `tables.keep_dof` says which DOF was which.
 
         Outputs that are no longer used fall silent, new ones are attached one after the other. Frame rate and motor period are
-        the same. `gather_*(values, old, scratch, count, fresh)` rearrange an array.
+        the same. `gather_*(values, old, scratch, count, fresh, at)` rearrange an array. If the DOFs and their outputs stay as they
+        were, no tick waits for this; else ticks that come meanwhile, some 10 ms, are made up for by the next one.
         """
-        state = self._board.lock()
         before = self.tables
+        if _same_dofs(tables, before):
+            self.tables = tables
+            self._take_over(tables)
+            return
+        self._paused = True
+        self.tables = tables
+        self._rearrange(before, tables, gather_words, gather_halves, scratch)
+        self._take_over(tables)
+        self._paused = False
+
+    def _rearrange(self, before, tables, gather_words, gather_halves, scratch):
         keep = tables.keep_dof
         dofs = tables.dofs
         attached = 0
         going_on = self._drivers.load(tables)
-        for d in range(dofs):
-            was = keep[d]
-            if was < before.dofs and self.attached >> was & 1 and _same_output(tables, d, before, was):
-                attached |= going_on & 1 << d
-            if (going_on & ~attached) >> d & 1:  # another DOF's output: the new one begins from its own pose
-                self._drivers.release(d)
-        for values, fresh in self._state():
+        for values, fresh in (
+            (self.position_q24, 0),
+            (self.velocity_q24, ZERO_Q24),
+            (self.reference_q24, ZERO_Q24),
+            (self._correction_q24, ZERO_Q24),
+        ):
             gather_words(values, keep, scratch, dofs, fresh, 0)
-        self.trajectory.rearrange(gather_words, gather_halves, keep, scratch, dofs)
-        self._character.rearrange(gather_words, keep, scratch, dofs)
         for place in range(2):
             gather_words(self._before_q24, keep, scratch, dofs, 0, place * _DOFS)
             gather_halves(self._end_q4us, keep, scratch, dofs, 0, place * _DOFS)
+        self.trajectory.rearrange(gather_words, gather_halves, keep, scratch, dofs)
+        self._character.rearrange(gather_words, keep, scratch, dofs)
         self.tap_ring.rearrange(gather_halves, keep, scratch, dofs, self.trajectory.newest)
-        self.tables = tables
         for d in range(dofs):
             self._turn[d] = ((self.ticks - self._since) & TICKS_MASK) % tables.turns[d]
-            if keep[d] >= before.dofs:
+            was = keep[d]
+            if was >= before.dofs:
                 self.position_q24[d] = tables.rest_q15[d] << 9
                 self._stand(d)
                 self.trajectory.stand_one(d, self.position_q24[d])
-                self._end_q4us[d] = tables.end0_q4us[d]
-                self._end_q4us[_DOFS + d] = tables.end1_q4us[d]
-            elif not _same_output(tables, d, before, keep[d]):
-                self._end_q4us[d] = tables.end0_q4us[d]
-                self._end_q4us[_DOFS + d] = tables.end1_q4us[d]
-        self.attached = attached
+            if was >= before.dofs or not _same_output(tables, d, before, was):
+                self._take_ends(d)
+                if going_on >> d & 1:  # it was another DOF's: the new one begins from its own pose
+                    self._drivers.release(d)
+            elif self.attached >> was & 1:
+                attached |= going_on & 1 << d
+        state = self._board.lock()
+        self.attached = attached if self.armed else 0  # the kill pin may have come in between
         self._hold_unattached()
-        self._take_over(tables)
         self._board.unlock(state)
 
     def start(self):
@@ -213,7 +254,7 @@ class Motor:
             due_us = (due_us + self._period_us) & TICKS_MASK
             self._starting = 2
         self.trajectory.prepare()
-        self.tick_max_us = self.tick_late_max_us = 0
+        self._times_us[0] = self._times_us[1] = 0
         board.unlock(state)
         return due_us
 
@@ -323,7 +364,6 @@ class Motor:
         board = self._board
         begun_us = board.ticks_us()
         tables = self.tables
-        dofs = tables.dofs
         self.ticks = (self.ticks + 1) & TICKS_MASK
         if tables.kill_pin != NO_PIN and self.armed and board.level(tables.kill_pin) == tables.kill_level:
             self.kill(KILLED_BY_PIN)
@@ -331,13 +371,29 @@ class Motor:
             self.silent = True
         else:
             self._quiet_ticks += 1
+        if self._paused:
+            self._missed += 1
+            return
+        while self._missed:
+            self._missed -= 1
+            self._step(tables)
+        self._step(tables)
+        self._keep_wait -= 1
+        if self._keep_wait <= 0:
+            self._keep_wait = self._keep_ticks
+            board.keep_pose(tables.dofs, self.position_q24)
+        _measure(self._times_us, self._period_us, begun_us, board.ticks_us())
+
+    def _step(self, tables):
+        """Take every DOF one step further and write the outputs whose turn it is."""
+        dofs = tables.dofs
         if self._starting:
             self._starting -= 1
             if self._starting == 0:
                 self.trajectory.start(dofs, self.position_q24)
                 self.playing = True
                 self.tapped[0] = -1
-                self._tap_part = -self._step - self._step // 2
+                self._tap_part = -self._part - self._part // 2
         resting = self.silent and tables.when_silent != SILENT_IDLE
         self.trajectory.advance(dofs, self.playing, tables.rest_q15 if resting else None)
         self._character.respond(dofs, self.trajectory.reference_q24)
@@ -360,39 +416,22 @@ class Motor:
         if due:
             self._drivers.write(self._level_q24, self._pulse_q18us, due)
             self._later |= due
-        self._keep_wait -= 1
-        if self._keep_wait <= 0:
-            self._keep_wait = self._keep_ticks
-            board.keep_pose(dofs, self.position_q24)
-        self._measure(begun_us)
 
     def _tap(self, dofs):
         """Note the course at the instants of frames that lie half a tick or more behind."""
-        part = self._tap_part + self._step
+        part = self._tap_part + self._part
         while part >= 0:
             frame = self.tapped[0] + 1
-            # z = 1 - part / step in Q15, in two steps that stay small
+            # z = 1 - part / (a tick's part of a frame) in Q15, in two steps that stay small
             scaled = part << 9
-            whole = scaled // self._step
-            z_q15 = 32768 - (whole << 6) - (((scaled - whole * self._step) << 6) // self._step)
+            whole = scaled // self._part
+            z_q15 = 32768 - (whole << 6) - (((scaled - whole * self._part) << 6) // self._part)
             calibration.tap(
                 self.position_q24, self._before_q24, dofs, z_q15, self.tap_ring.value_q15, (frame & 15) * _DOFS
             )
             self.tapped[0] = frame
             part -= _MICRO
         self._tap_part = part
-
-    def _measure(self, begun_us):
-        """Keep the longest tick, and the largest lateness of one against the first."""
-        if self._expected_us < 0:
-            self._expected_us = begun_us
-        late_us = ticks_diff(begun_us, self._expected_us)
-        if late_us > self.tick_late_max_us:
-            self.tick_late_max_us = late_us
-        self._expected_us = (self._expected_us + self._period_us) & TICKS_MASK
-        took_us = ticks_diff(self._board.ticks_us(), begun_us)
-        if took_us > self.tick_max_us:
-            self.tick_max_us = took_us
 
     # --- shared
 
@@ -416,8 +455,11 @@ class Motor:
                 if tables.relative[d]:
                     self.position_q24[d] = _STILL_Q24
 
+    def _take_ends(self, dof):
+        self._end_q4us[dof] = self.tables.end0_q4us[dof]
+        self._end_q4us[_DOFS + dof] = self.tables.end1_q4us[dof]
+
     def _take_over(self, tables):
-        self.trajectory.load(tables)
         self._character.load(tables)
         self.feedback.load(tables)
         self.guards.load()
@@ -428,18 +470,20 @@ class Motor:
     def _set_rates(self, tables):
         period_us = tables.motor_period_us
         self._period_us = period_us
-        self._step = period_us * tables.frame_rate_hz
+        self._part = period_us * tables.frame_rate_hz
         self._calm_q24 = _CALM_PER_S * (POSITION_ONE // 2) * period_us // _MICRO
         self._glide_q4us = max(1, _GLIDE_US_PER_S * 16 * period_us // _MICRO)
         self._keep_ticks = _KEEP_US // period_us
 
-    def _state(self):
-        return (
-            (self.position_q24, 0),
-            (self.velocity_q24, ZERO_Q24),
-            (self.reference_q24, ZERO_Q24),
-            (self._correction_q24, ZERO_Q24),
-        )
+
+def _same_dofs(tables, other):
+    """Return whether DOFs and outputs are those of other tables, in the same order."""
+    if tables.dofs != other.dofs:
+        return False
+    for d in range(tables.dofs):
+        if tables.keep_dof[d] != d or not _same_output(tables, d, other, d):
+            return False
+    return True
 
 
 def _same_output(tables, dof, other, was):
