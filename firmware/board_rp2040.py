@@ -109,9 +109,13 @@ def _quiet(count: int, use: ptr8):
 
 
 @micropython.viper
-def _compare(pin: int, counts: int, use: ptr8):
-    """Set the compare value of a pin's channel, which takes effect with the next period; connect the pin if it is time."""
+def _compare(pin: int, duty_q16: int, use: ptr8):
+    """Set a channel to its part of 6250 counts, from its next period on; connect the pin if it is time.
+
+    Bits: 65536 times 6250 stays below 2^29.
+    """
     now = int(use[pin])
+    counts = (duty_q16 * _BRIDGE_COUNTS + 0x8000) >> 16
     if now == _CLEARS:
         use[pin] = _CONNECTS
     elif now:
@@ -492,7 +496,7 @@ class Board:
 
     def bridge_write(self, pin, duty_q16):
         """Let a pin be high for a part of each 50 us, 65536 being all of it."""
-        _compare(pin, (duty_q16 * _BRIDGE_COUNTS + 0x8000) >> 16, self._use)
+        _compare(pin, duty_q16, self._use)
 
     # --- analogue inputs and I2C
 

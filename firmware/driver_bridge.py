@@ -21,31 +21,30 @@ _STOP_Q24 = const(0x800000)
 
 
 @micropython.viper
-def _steer(count: int, level_q24: ptr32, attached: ptr8, invert: ptr8, due: int, duty_q16: ptr32, backward: ptr8):
-    """Write duty and direction of the attached DOFs in `due`: 0..65536 and 0 or 1.
+def _steer(count: int, level_q24: ptr32, invert: ptr8, due: int, duty_q16: ptr32, backward: ptr8):
+    """Write duty and direction of the DOFs in `due`: 0..65536 and 0 or 1.
 
     A direction changes only where the duty was 0 before; otherwise the duty becomes 0. Bits: a level lies in 0..2^24, its
     distance from the stop within 2^23.
     """
     d = 0
     while d < count:
-        if attached[d]:
-            if (due >> d) & 1:
-                speed = int(level_q24[d]) - _STOP_Q24
-                if invert[d]:
-                    speed = -speed
-                back = 0
-                if speed < 0:
-                    back = 1
-                    speed = -speed
-                duty = (speed + 64) >> 7
-                if duty:
-                    if back != int(backward[d]):
-                        if duty_q16[d]:
-                            duty = 0
-                        else:
-                            backward[d] = back
-                duty_q16[d] = duty
+        if (due >> d) & 1:
+            speed = int(level_q24[d]) - _STOP_Q24
+            if invert[d]:
+                speed = -speed
+            back = 0
+            if speed < 0:
+                back = 1
+                speed = -speed
+            duty = (speed + 64) >> 7
+            if duty:
+                if back != int(backward[d]):
+                    if duty_q16[d]:
+                        duty = 0
+                    else:
+                        backward[d] = back
+            duty_q16[d] = duty
         d += 1
 
 
@@ -56,8 +55,7 @@ class BridgeDriver(Driver):
 
     def __init__(self, board):
         self._board = board
-        self._attached = bytearray(DOFS_MAX)
-        self._mask = 0  # the same as bits
+        self._attached = 0  # bits of DOFs
         self._wiring = bytearray(DOFS_MAX)
         self._pin_a = bytearray(DOFS_MAX)
         self._pin_b = bytearray(DOFS_MAX)
@@ -86,19 +84,13 @@ class BridgeDriver(Driver):
 
     def load(self, tables):
         """Keep the motors whose settings are the same for the same DOF; all others stand."""
+        settings = tables.settings
         kept = 0
         for dof in range(DOFS_MAX):
-            at = dof * SETTINGS_MAX
-            settings = tables.settings
             mine = dof < tables.dofs and tables.driver[dof] == DRIVER_BRIDGE
-            if self._attached[dof]:
-                if (
-                    mine
-                    and settings[at] == self._wiring[dof]
-                    and settings[at + 1] == self._pin_a[dof]
-                    and settings[at + 2] == self._pin_b[dof]
-                    and settings[at + 3] == self._invert[dof]
-                ):
+            at = dof * SETTINGS_MAX
+            if self._attached >> dof & 1:
+                if mine and self._is(dof, settings, at):
                     kept |= 1 << dof
                 else:
                     self.release(dof)
@@ -108,6 +100,15 @@ class BridgeDriver(Driver):
                 self._pin_b[dof] = settings[at + 2]
                 self._invert[dof] = settings[at + 3]
         return kept
+
+    def _is(self, dof, settings, at):
+        """Return whether a DOF has these settings already."""
+        return (
+            settings[at] == self._wiring[dof]
+            and settings[at + 1] == self._pin_a[dof]
+            and settings[at + 2] == self._pin_b[dof]
+            and settings[at + 3] == self._invert[dof]
+        )
 
     def attach(self, dof, until_us):
         """Let a motor have PWM, at duty 0 until the next write."""
@@ -120,23 +121,21 @@ class BridgeDriver(Driver):
         self._duty_q16[dof] = 0
         self._backward[dof] = 0
         self._driven[dof] = 0
-        self._attached[dof] = 1
-        self._mask |= 1 << dof
+        self._attached |= 1 << dof
 
     def release(self, dof):
         """Drive a motor's pins low."""
-        if self._attached[dof]:
-            self._attached[dof] = 0
-            self._mask &= ~(1 << dof)
+        if self._attached >> dof & 1:
+            self._attached &= ~(1 << dof)
             self._board.pin_low(self._pin_a[dof])
             self._board.pin_low(self._pin_b[dof])
 
     def write(self, level_q24, pulse_q18us, due):
         """Set duty and direction of the attached DOFs in `due`."""
-        due &= self._mask
+        due &= self._attached
         if not due:
             return
-        _steer(DOFS_MAX, level_q24, self._attached, self._invert, due, self._duty_q16, self._backward)
+        _steer(DOFS_MAX, level_q24, self._invert, due, self._duty_q16, self._backward)
         dof = 0
         while due:
             if due & 1:
@@ -146,22 +145,19 @@ class BridgeDriver(Driver):
 
     def _write(self, dof):
         board = self._board
+        pin = self._pin_a[dof]
+        other = self._pin_b[dof]
         backward = self._backward[dof]
-        if self._wiring[dof] == 0:
+        if self._wiring[dof]:
+            # The pin of the other direction has duty 0: it was the last that it got.
+            board.bridge_write(other if backward else pin, self._duty_q16[dof])
+        else:
             if backward != self._driven[dof]:
                 self._driven[dof] = backward
-                board.drive(self._pin_b[dof], backward)
-            board.bridge_write(self._pin_a[dof], self._duty_q16[dof])
-        elif backward:
-            board.bridge_write(self._pin_a[dof], 0)
-            board.bridge_write(self._pin_b[dof], self._duty_q16[dof])
-        else:
-            board.bridge_write(self._pin_b[dof], 0)
-            board.bridge_write(self._pin_a[dof], self._duty_q16[dof])
+                board.drive(other, backward)
+            board.bridge_write(pin, self._duty_q16[dof])
 
     def quiet(self):
         """Drive all PWM pins low, now; the direction does not matter then."""
         self._board.quiet()
-        for dof in range(DOFS_MAX):
-            self._attached[dof] = 0
-        self._mask = 0
+        self._attached = 0

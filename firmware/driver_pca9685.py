@@ -265,6 +265,7 @@ class Pca9685Driver(Driver):
         self._board = board
         self._chips = [_Chip(board) for _ in range(DEVICES_MAX)]
         self._enabled = bytearray(DEVICES_MAX)  # whether OE is low
+        self._used = False
 
     def check_device(self, settings, count):
         """Return None, or the number of the setting that is missing, surplus or out of range."""
@@ -325,6 +326,10 @@ class Pca9685Driver(Driver):
     def load(self, tables):
         """Keep the pulses of channels that stay, on chips that stay as they are."""
         kept = 0
+        used = DRIVER_PCA9685 in tables.device_driver
+        if not used and not self._used:
+            return 0
+        self._used = used
         for device in range(DEVICES_MAX):
             chip = self._chips[device]
             old_oe = chip.oe
@@ -373,7 +378,7 @@ class Pca9685Driver(Driver):
             if chip.oe != NO_PIN:
                 self._board.drive(chip.oe, 1)
                 self._enabled[device] = 0
-            chip.quiet()
+                chip.quiet()
 
     def bus_errors(self):
         """Return how many transfers have failed."""

@@ -21,10 +21,9 @@ class PinsDriver(Driver):
 
     def __init__(self, board):
         self._board = board
-        self._pin = bytearray([NO_PIN] * DOFS_MAX)  # of the outputs that there are
+        self._attached = 0  # bits of DOFs
+        self._pin = bytearray([NO_PIN] * DOFS_MAX)
         self._period_us = halves(DOFS_MAX)
-        self._pulsing = bytearray([NO_PIN] * DOFS_MAX)  # the pins of those that are attached
-        self._spare = bytearray(DOFS_MAX)
 
     def pwm(self, settings, place):
         """Return the numbers of the settings that are PWM pins."""
@@ -36,47 +35,42 @@ class PinsDriver(Driver):
 
     def load(self, tables):
         """Keep the pulses of pins that have the same period in the new tables; all others fall silent."""
+        pins = self._pin
+        pulsing = []  # pin and period
+        for dof in range(DOFS_MAX):
+            if self._attached >> dof & 1:
+                pulsing.append((pins[dof], self._period_us[dof]))
+            pins[dof] = NO_PIN
         kept = 0
-        before = self._pulsing
-        after = self._spare
-        for dof in range(DOFS_MAX):
-            after[dof] = NO_PIN
-            if dof < tables.dofs and tables.driver[dof] == DRIVER_PINS:
-                pin = tables.settings[dof * SETTINGS_MAX]
-                period_us = self.period_us(tables, dof)
-                for old in range(DOFS_MAX):
-                    if before[old] == pin and self._period_us[old] == period_us:
-                        before[old] = NO_PIN
-                        after[dof] = pin
-                        kept |= 1 << dof
-        for dof in range(DOFS_MAX):
-            if before[dof] != NO_PIN:
-                self._board.pin_low(before[dof])
-            mine = dof < tables.dofs and tables.driver[dof] == DRIVER_PINS
-            self._pin[dof] = tables.settings[dof * SETTINGS_MAX] if mine else NO_PIN
-            self._period_us[dof] = self.period_us(tables, dof) if mine else 0
-        self._pulsing = after
-        self._spare = before
+        for dof in range(tables.dofs):
+            if tables.driver[dof] == DRIVER_PINS:
+                pins[dof] = tables.settings[dof * SETTINGS_MAX]
+                self._period_us[dof] = self.period_us(tables, dof)
+                output = (pins[dof], self._period_us[dof])
+                if output in pulsing:
+                    pulsing.remove(output)
+                    kept |= 1 << dof
+        for pin, _ in pulsing:
+            self._board.pin_low(pin)
+        self._attached = kept
         return kept
 
     def attach(self, dof, until_us):
         """Give the DOF's pin to its PWM slice, which begins a period 1 ms after the DOF's next turn."""
         self._board.servo_attach(self._pin[dof], self._period_us[dof], until_us + _AFTER_TICK_US)
-        self._pulsing[dof] = self._pin[dof]
+        self._attached |= 1 << dof
 
     def release(self, dof):
         """Drive the DOF's pin low."""
-        pin = self._pulsing[dof]
-        if pin != NO_PIN:
-            self._pulsing[dof] = NO_PIN
-            self._board.pin_low(pin)
+        if self._attached >> dof & 1:
+            self._attached &= ~(1 << dof)
+            self._board.pin_low(self._pin[dof])
 
     def write(self, level_q24, pulse_q18us, due):
         """Set the pulse widths of the attached DOFs in `due`."""
-        self._board.servo_write(DOFS_MAX, self._pulsing, due, pulse_q18us)
+        self._board.servo_write(DOFS_MAX, self._pin, due & self._attached, pulse_q18us)
 
     def quiet(self):
         """Drive all pins low, now."""
         self._board.quiet()
-        for dof in range(DOFS_MAX):
-            self._pulsing[dof] = NO_PIN
+        self._attached = 0

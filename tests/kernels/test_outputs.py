@@ -197,7 +197,7 @@ def test_pin_is_connected_by_the_write_after_its_channel_was_cleared(memory, ker
         if kernel == "_pulses":
             BOARD._pulses(1, bytes([7]), 1, words([1000 << 18]), use)
         else:
-            BOARD._compare(7, 3125, use)
+            BOARD._compare(7, 32768, use)
         seen.append((use[7], memory.compare(7), memory.function(7)))
     assert seen == [(CONNECTS, 0, 0), (PULSES, 3125, FUNCTION_PWM), (PULSES, 3125, FUNCTION_PWM)]
     assert memory.written[0][0] == slice_of(7) + CC, "the width is set before the pin is connected"
@@ -205,10 +205,17 @@ def test_pin_is_connected_by_the_write_after_its_channel_was_cleared(memory, ker
 
 def test_compare_leaves_the_other_channel_and_unused_pins_alone(memory):
     memory.word[slice_of(8) + CC] = 0xFFFF8001
-    BOARD._compare(9, 6250, uses({9: PULSES}))
+    BOARD._compare(9, 65536, uses({9: PULSES}))
     assert [memory.compare(8), memory.compare(9)] == [0x8001, 6250]
     BOARD._compare(8, 17, uses({9: PULSES}))
     assert memory.compare(8) == 0x8001
+
+
+@given(integers(0, 65536))
+def test_compare_gives_the_nearest_part_of_50_us(duty_q16):
+    memory = fresh_memory()
+    BOARD._compare(9, duty_q16, uses({9: PULSES}))
+    assert memory.compare(9) == rounded(Fraction(duty_q16 * 6250, 65536))
 
 
 @pytest.mark.parametrize("pin", PINS)
