@@ -102,7 +102,8 @@ class Commands:
     # --- the session
 
     def _on_hello(self, body, length):
-        self._puppet.cues.clear()
+        if self._puppet.frame != 0:  # before the first frame, what a kept puppet begins with still waits
+            self._puppet.cues.clear()
         self._telemetry.ask(0, 0, 0)
         for place in range(length):  # byte by byte, because a host may come back during a performance
             if body[_PAYLOAD + place] != self._hello[place]:

@@ -250,6 +250,17 @@ def test_file_is_kept_and_played():
     assert not mcu.puppet.motor.armed
 
 
+def test_greeting_before_the_first_frame_does_not_forget_what_the_file_begins_with():
+    mcu = Mcu({STORE.NAME: as_file(CONTENT)})
+    mcu.load()
+    hello = {"protocol": messages.PROTOCOL, "dictionary": mcu.commands.dictionary}
+    assert mcu.do("hello", hello) == messages.OK
+    assert mcu.puppet.cues.count == 1
+    mcu.puppet.frame = 1
+    assert mcu.do("hello", hello) == messages.OK
+    assert mcu.puppet.cues.count == 0, "later it begins a new session"
+
+
 def test_outputs_are_armed_at_the_start_only_if_the_robot_says_so():
     mcu = Mcu({STORE.NAME: as_file(with_autostart())})
     assert mcu.load() == formats.STORE_PLAYED
