@@ -34,7 +34,6 @@ from shared.formats import DOFS_MAX, FEEDBACK_PIN_FIRST, FEEDBACK_PIN_LAST, NO_P
 
 CHANNELS = FEEDBACK_PIN_LAST - FEEDBACK_PIN_FIRST + 1
 
-_NOBODY = const(255)
 _LAG_US = const(100000)  # of the command, until it is compared
 _FADE_US = const(500000)  # of the correction, once readings are lost
 _ZERO = const(0x10000000)
@@ -76,17 +75,30 @@ _LOST = const(1)
 _STALLED = const(2)
 _BEFORE = const(3)  # those that had pulses in the tick before
 
+# Besides, in `masks`.
+_CHANNELS = const(4)
+_LAG_Q15 = const(5)  # share of the low-pass per tick
+_TURN = const(6)  # the channel that is converted next
+_UNDER_WAY = const(7)  # 1 more than the channel that is being converted, 0 for none
+_READ = const(8)  # 1 more than the channel whose conversion is over
+
+# What `tick` does.
+_RUNS = const(0)
+_PAUSES = const(1)
+_BEGINS = const(2)
+
 
 @micropython.viper
 def _follow(
-    position_q24: ptr32, correction_q24: ptr32, settings: ptr32, state: ptr32, masks: ptr32, channels: int,
-    attached: int, lag_q15: int,
-):  # fmt: skip
-    """Let the commands of all channels, without their corrections, pass the low-pass; `lag` is its share per tick.
+    position_q24: ptr32, correction_q24: ptr32, settings: ptr32, state: ptr32, masks: ptr32, attached: int
+) -> int:  # fmt: skip
+    """Let the commands of all channels, without their corrections, pass the low-pass, and choose the next channel.
 
-    A DOF that had no pulses until now has no lag.
+    A DOF that had no pulses until now has no lag. Returns the pin whose conversion is to be started.
     Bits: a command is within -1..2, a difference within 3 in Q24, below 2^26; in limbs of 14 + 12 times 15: below 2^29.
     """
+    channels = masks[_CHANNELS]
+    lag_q15 = masks[_LAG_Q15]
     both = attached & masks[_BEFORE]
     masks[_BEFORE] = attached
     k = 0
@@ -101,19 +113,27 @@ def _follow(
             lagged = wanted
         state[k << 2] = lagged + _ZERO
         k += 1
+    turn = masks[_TURN]
+    masks[_READ] = masks[_UNDER_WAY]
+    masks[_UNDER_WAY] = turn + 1
+    masks[_TURN] = turn + 1 if turn + 1 < channels else 0
+    return settings[(turn << 4) + _PIN]
 
 
 @micropython.viper
 def _correct(
-    position_q24: ptr32, correction_q24: ptr32, settings: ptr32, state: ptr32, masks: ptr32, channel: int,
-    attached: int, ratio_q15: int,
+    position_q24: ptr32, correction_q24: ptr32, settings: ptr32, state: ptr32, masks: ptr32, attached: int,
+    ratio_q15: int,
 ):  # fmt: skip
-    """Take a channel's reading into account: write its DOF's measured value, correction, and bits.
+    """Take the reading of the channel that is over into account: write its DOF's measured value, correction, and bits.
 
     Bits: measured is within -1/4..5/4 (its product below 1.25 * 2^29), the error clamped to -1..1, as are gain and
     correction. `error * gain` in limbs of 13 + 12 and 15; `error * integral`, Q48 to Q28, in limbs of 13 + 12 each: 2^25 * 16.
     The integral, within 1 and a turn's growth, stays within 2^29.
     """
+    channel = masks[_READ] - 1
+    if channel < 0:
+        return
     s = channel << 4
     t = channel << 2
     d = settings[s + _DOF]
@@ -205,16 +225,13 @@ class Feedback:
 
     def __init__(self, board):
         self._board = board
-        self._channels = 0
-        self._turn = 0  # the channel whose conversion comes next
-        self._under_way = _NOBODY  # the channel that is being converted
+        self._mode = _BEGINS
         self._rates = (0, 0)  # what the following two have been computed for: motor period, number of channels
         self._lag_q15 = 0
         self._fade_q15 = 0
-        self._is_new = True
         self._settings = words(16 * CHANNELS)
         self._state = words(4 * CHANNELS)
-        self._masks = words(4)
+        self._masks = words(9)
         self._channel_of = bytearray(DOFS_MAX)
 
     @property
@@ -238,8 +255,8 @@ class Feedback:
         The integral term is set per motor tick: an error of 1 moves the correction by `feedback_integral_q24` in each. A
         DOF that is measured in every third tick only moves by three times as much then.
         """
+        self._mode = _PAUSES
         kept = self._integrals()
-        self._channels = 0  # from here on no tick comes in between
         settings, state = self._settings, self._state
         channels = 0
         for dof in range(tables.dofs):
@@ -249,7 +266,7 @@ class Feedback:
             self._lag_q15 = 32768 - exp_q15(tables.motor_period_us, _LAG_US)
             self._fade_q15 = 32768 - exp_q15(channels * tables.motor_period_us, _FADE_US)
         channel = 0
-        for place in range(4):
+        for place in range(len(self._masks)):
             self._masks[place] = 0
         for dof in range(tables.dofs):
             pin = tables.feedback_pin[dof]
@@ -283,10 +300,13 @@ class Feedback:
             state[t + _RUN] = 0
             self._channel_of[dof] = channel
             channel += 1
-        self._turn = 0
-        self._under_way = _NOBODY
-        self._is_new = True
-        self._channels = channels
+        self._masks[_CHANNELS] = channels
+        self._masks[_LAG_Q15] = self._lag_q15
+        self._mode = _BEGINS
+
+    def pause(self):
+        """Leave the corrections alone until the next `load`: the tables are about to change."""
+        self._mode = _PAUSES
 
     def tick(self, attached, position_q24, correction_q24):
         """Read the conversion that the last tick has started, start the next one, and write the corrections.
@@ -294,30 +314,27 @@ class Feedback:
         `attached` has the bit of each DOF that has pulses, `position_q24` is where the DOFs are led, corrections included,
         `correction_q24` (with `ZERO_Q24` added) what these are, as they were written last. Allocates nothing.
         """
+        if self._mode != _RUNS:
+            if self._mode == _BEGINS:
+                self._begin(correction_q24)
+            return
+        board = self._board
         settings = self._settings
         state = self._state
         masks = self._masks
-        channels = self._channels
-        if self._is_new:
-            self._is_new = False
-            masks[_BEFORE] = 0
-            for dof in range(DOFS_MAX):
-                correction_q24[dof] = _ZERO
-            for channel in range(channels):
-                integral = state[4 * channel + _SUM_Q28] - _ZERO_Q28
-                correction_q24[settings[16 * channel]] = (integral >> 4) + _ZERO
-        if channels:
-            board = self._board
-            turn = self._turn
-            read = self._under_way
-            ratio_q15 = board.adc_read() if read != _NOBODY else 0
-            board.adc_start(settings[16 * turn + _PIN])
-            self._under_way = turn
-            turn += 1
-            self._turn = turn if turn < channels else 0
-            _follow(position_q24, correction_q24, settings, state, masks, channels, attached, self._lag_q15)
-            if read != _NOBODY:
-                _correct(position_q24, correction_q24, settings, state, masks, read, attached, ratio_q15)
+        ratio_q15 = board.adc_read()
+        board.adc_start(_follow(position_q24, correction_q24, settings, state, masks, attached))
+        _correct(position_q24, correction_q24, settings, state, masks, attached, ratio_q15)
+
+    def _begin(self, correction_q24):
+        """Write the corrections that are known from before."""
+        channels = self._masks[_CHANNELS]
+        for dof in range(DOFS_MAX):
+            correction_q24[dof] = _ZERO
+        for channel in range(channels):
+            integral = self._state[4 * channel + _SUM_Q28] - _ZERO_Q28
+            correction_q24[self._settings[16 * channel]] = (integral >> 4) + _ZERO
+        self._mode = _RUNS if channels else _PAUSES
 
     def measured(self, dof):
         """Return where a DOF is, Q24 in 0..1, or -1 if that is not known."""
@@ -350,7 +367,7 @@ class Feedback:
         """Return {(pin, ratio at 0, ratio at 1): integral in Q28 with 2 added}."""
         kept = {}
         settings = self._settings
-        for s in range(0, 16 * self._channels, 16):
+        for s in range(0, 16 * self._masks[_CHANNELS], 16):
             key = settings[s + _PIN], settings[s + _AT0_Q15], settings[s + _AT1_Q15]
             kept[key] = self._state[s // 4 + _SUM_Q28]
         return kept

@@ -73,13 +73,13 @@ class Servo:
 class Converter:
     """What a board offers to feedback: conversions, of servos by pin, and critical sections.
 
-    A conversion gives what the potentiometer reads when it is started. `started` lists the pins.
+    A conversion gives what the potentiometer reads when it is started, 0 before the first. `started` lists the pins.
     """
 
     def __init__(self, servos):
         self.servos = servos
         self.started = []
-        self._result_q15 = None
+        self._result_q15 = 0
         self._locked = False
 
     def adc_start(self, pin):
@@ -87,9 +87,7 @@ class Converter:
         self._result_q15 = self.servos[pin].ratio_q15()
 
     def adc_read(self):
-        assert self._result_q15 is not None, "no conversion has been started"
-        result_q15, self._result_q15 = self._result_q15, None
-        return result_q15
+        return self._result_q15
 
     def lock(self):
         assert not self._locked

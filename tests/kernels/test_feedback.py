@@ -11,7 +11,7 @@ from tests.checked import load_checked
 from tests.kernels.values import halves, integers, words
 from tests.plant import Converter, Servo
 
-TICKED = ("Feedback.tick", "Feedback.measured", "Feedback.start", "Feedback.forgive", "_clamped")
+TICKED = ("Feedback.tick", "Feedback._begin", "Feedback.measured", "Feedback.start", "Feedback.forgive", "_clamped")
 MODULE = load_checked("firmware/feedback.py", bytecode=TICKED)
 ONE = 1 << 24
 ZERO = 1 << 28
@@ -118,14 +118,18 @@ def channels(draw):
     return settings, [lagged_q24, 0, integral_q28, draw(st.integers(0, settings[11]))], correction_q24
 
 
-@given(channels(), integers(0, ONE), integers(0, 32768), st.sampled_from([0, 8]), st.sampled_from([0, 8]))
-def test_correction_is_the_definition_s(channel, position_q24, ratio_q15, attached, stalled):
+@given(
+    channels(), st.booleans(), integers(0, ONE), integers(0, 32768), st.sampled_from([0, 8]), st.sampled_from([0, 8])
+)
+def test_correction_is_the_definition_s(channel, is_slow, position_q24, ratio_q15, attached, stalled):
     settings, (lagged_q24, _, integral_q28, run), correction_q24 = channel
+    if is_slow:
+        lagged_q24 = max(-ONE, min(position_q24 - correction_q24 + lagged_q24 % 1000, 2 * ONE))
     position, correction = words([0] * 16), words([0] * 16)
     position[3], correction[3] = position_q24, correction_q24 + ZERO
     state = words([lagged_q24 + ZERO, ZERO, integral_q28 + ZERO_Q28, run])
-    masks = words([8, 0, stalled, 0])
-    MODULE._correct(position, correction, words(settings), state, masks, 0, attached, ratio_q15)
+    masks = words([8, 0, stalled, 0, 1, 0, 0, 1, 1])
+    MODULE._correct(position, correction, words(settings), state, masks, attached, ratio_q15)
     found = (correction[3] - ZERO) / ONE
     found_integral = (state[2] - ZERO_Q28) / (1 << 28)
 
@@ -179,12 +183,16 @@ def test_correction_is_the_definition_s(channel, position_q24, ratio_q15, attach
 def test_command_passes_the_low_pass_without_its_correction(before, attached, position, correction, lagged, lag_q15):
     arrays = words([0] * 16), words([ZERO] * 16)
     arrays[0][3], arrays[1][3] = position, correction + ZERO
-    settings, state, masks = words([3] + [0] * 15), words([lagged + ZERO, 1, 2, 3]), words([0, 0, 0, before])
-    MODULE._follow(*arrays, settings, state, masks, 1, attached, lag_q15)
+    settings, state, masks = (
+        words([3] + [0] * 13 + [PIN, 0]),
+        words([lagged + ZERO, 1, 2, 3]),
+        words([0, 0, 0, before, 1, lag_q15, 0, 0, 9]),
+    )
+    assert MODULE._follow(*arrays, settings, state, masks, attached) == PIN
     wanted = position - correction
     expected = lagged + (wanted - lagged) * lag_q15 / 32768 if before and attached else wanted
     assert abs(state[0] - ZERO - expected) <= 1.5
-    assert list(state[1:]) == [1, 2, 3] and list(masks) == [0, 0, 0, attached]
+    assert list(state[1:]) == [1, 2, 3] and list(masks) == [0, 0, 0, attached, 1, lag_q15, 0, 1, 0]
 
 
 # ---- readings
@@ -208,7 +216,7 @@ def test_measured_value_is_the_potentiometer_s(ends):
 
 def test_potentiometers_take_turns():
     loop = Loop(20000, [Servo(place=place) for place in (0.2, 0.5, 0.8)])
-    loop.run(0.2, 0.2, 0.5, 0.8)
+    loop.run(0.22, 0.2, 0.5, 0.8)  # the first tick begins
     assert loop.board.started == [26, 27, 28, 26, 27, 28, 26, 27, 28, 26]
     assert [round(loop.feedback.measured(dof) / ONE, 1) for dof in range(3)] == [0.2, 0.5, 0.8]
 
