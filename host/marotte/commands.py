@@ -89,7 +89,8 @@ def run_on_mcu(files: Files, mcu: str, options: RunOptions, console: Console) ->
             interrupted = _perform(files, carrier, f"emulated {mcu} at {live.url}", options, console)
         finally:
             carrier.close()
-        if files.robot and options.arm:
+        has_pins = files.robot and any(output.drive.pulse_pin for output in files.robot.outputs.values())
+        if files.robot and options.arm and has_pins:
             live.stop()
             _print_pulses(measure(virtual, files.robot), console)
     return interrupted

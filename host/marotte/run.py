@@ -149,8 +149,11 @@ class _Play:
                 self._restart(self.files)
                 raise
             self._restart(files)
-            rates = f"{files.puppet.frame_rate_hz} frames and {float(1 / tables.tick_s):.0f} motor ticks a second"
-            how = f"with another rate: its motion begins anew at {rates}"
+            how = (
+                f"with a new frame rate: its motion begins anew at {files.puppet.frame_rate_hz} frames a second"
+                if files.puppet.frame_rate_hz != before.frame_rate_hz
+                else f"with a new motor rate: its motion begins anew at {float(1 / tables.tick_s):.4g} ticks a second"
+            )
         else:
             self.session.exchange(tables, before)
             took_ms = (self.session.carrier.now_us() - begin_us) / 1000
