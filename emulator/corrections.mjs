@@ -3,6 +3,7 @@
 import { BasePeripheral } from 'rp2040js';
 
 const XIP_CTRL = 0x14000;
+const RESETS = 0x4000c;
 const TIMER = 0x40054;
 const WATCHDOG = 0x40058;
 const ROSC = 0x40060;
@@ -43,6 +44,17 @@ function alarmOnTheMicrosecond(mcu, timer) {
     const nowMicros = Math.floor(mcu.clock.micros);
     const deltaMicros = (value - nowMicros) >>> 0;
     alarm.clockAlarm.scheduleAt((nowMicros + deltaMicros) * 1000);
+  };
+}
+
+/** Call `callback` when the firmware resets one of the chip's blocks; rp2040js only takes note of the bit. */
+export function onBlockReset(mcu, bit, callback) {
+  const resets = mcu.peripherals[RESETS];
+  const write = resets.writeUint32;
+  resets.writeUint32 = (offset, value) => {
+    const before = resets.reset;
+    write.call(resets, offset, value);
+    if (resets.reset & ~before & (1 << bit)) callback();
   };
 }
 
