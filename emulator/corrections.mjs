@@ -4,10 +4,12 @@ import { BasePeripheral } from 'rp2040js';
 
 const XIP_CTRL = 0x14000;
 const RESETS = 0x4000c;
+const PSM = 0x40010;
 const TIMER = 0x40054;
 const WATCHDOG = 0x40058;
 const ROSC = 0x40060;
 const VREG_AND_CHIP_RESET = 0x40064;
+const PSM_PROC0 = 1 << 15;
 const ROSC_STATUS_STABLE = [0x18, 0x81001000];
 const ROSC_RANDOMBIT = [0x1c, 1];
 
@@ -65,11 +67,15 @@ export function keepWatchdogState(from, to) {
   after.reason = before.reason;
 }
 
+/**
+ * Call `callback` when the watchdog resets the chip. It does only what the firmware has chosen in the power-on state machine
+ * (RP2040 data sheet, section 2.13.5), nothing by default; here the choice is that of the processor, and then all is reset.
+ */
 export function onWatchdogReset(mcu, callback) {
   const watchdog = mcu.peripherals[WATCHDOG];
   watchdog.onWatchdogTrigger = () => {
     watchdog.timer.enable = false; // it would go off again in the same instant, for ever
-    callback();
+    if (mcu.peripherals[PSM].wdsel & PSM_PROC0) callback();
   };
 }
 
