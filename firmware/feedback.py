@@ -356,7 +356,8 @@ class Feedback:
 
     def forgive(self, dof):
         """Forget that a DOF has stalled."""
-        board, masks = self._board, self._masks
+        board = self._board
+        masks = self._masks
         state = board.lock()
         if masks[_STALLED] & (1 << dof):
             masks[_STALLED] ^= 1 << dof

@@ -186,12 +186,21 @@ def test_bucket_is_exact(steps, duty_q15, window_s):
     integers(0, 65535, 100),
     st.booleans(),
     integers(-ONE, ONE, 0, 4096, 4097, -4096, -4097),
+    st.booleans(),
 )
-@example(HALF, 0, HALF, True, True, 95, 0, True, 0)
+@example(HALF, 0, HALF, True, True, 95, 0, True, 0, True)
+@example(HALF, 327, HALF, False, True, 95, 0, True, -4096, True)
+@example(HALF, 328, HALF, False, True, 95, 0, True, 0, True)
+@example(HALF, -328, HALF, False, True, 95, 0, True, 0, True)
+@example(HALF, 0, HALF, False, True, 95, 0, True, 4097, True)
+@example(HALF, 0, HALF, False, True, 95, 0, True, -4097, True)
 def test_dof_stands_where_it_should(
-    position, velocity, reference, relative, attached, before, release_ms, relaxing, change
+    position, velocity, reference, relative, attached, before, release_ms, relaxing, change, is_near
 ):
     still, masks = words([before]), words([1 if attached else 0, 1, 0, 0, 0])
+    if is_near:
+        position = min(max(position, ONE // 8), ONE - ONE // 8)
+        reference = position + reference % ((ONE >> 9) + 2)
     low, high, seen = ONE // 8, ONE - ONE // 8, words([position - change])
     arrays = words([position]), words([velocity + ZERO]), words([reference + ZERO]), words([low]), words([high])
     full = halves([32768]), words([0]), words([0]), words([0])
