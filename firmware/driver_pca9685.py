@@ -99,7 +99,8 @@ class _Chip:
         self.oe = NO_PIN
         self.mask = 0  # the DOFs on this chip, as bits
         self.attached = 0  # those of them that have pulses
-        self.fresh = False  # written since its channels were switched off
+        self.written = 0  # those of them that the chip has been told about
+        self.fresh = False  # whether it has been written since all were switched off
         self.errors = 0
         self._board = board
         self._settings = [0] * DEVICE_SETTINGS_MAX
@@ -135,8 +136,9 @@ class _Chip:
             same = same and wanted == self._divider[1]
             self._divider[1] = wanted
             self._scale_q21 = (settings[5] << 21) // (1000 * (wanted + 1))
+        self.written = self.attached
         if not same or not period_us:
-            self.attached = 0
+            self.attached = self.written = 0
             self.fresh = False
             self._attempts = 1 + _RETRIES
             self.state = _RESET if used and period_us else _UNUSED
@@ -184,13 +186,14 @@ class _Chip:
     def release(self, dof):
         """Take them away with the next transfer."""
         self.attached &= ~(1 << dof)
+        self.written &= ~(1 << dof)
         if self.attached == 0:
             self.fresh = False
         self._waits = True
 
     def quiet(self):
         """Take all pulses away; OE has done so already."""
-        self.attached = 0
+        self.attached = self.written = 0
         self.fresh = False
         self._waits = True
         self._quiets = (self._quiets + 1) & 0xFFFF
@@ -202,12 +205,14 @@ class _Chip:
             quiets = self._quiets
             waits = self._waits
             self._waits = False
-            _fill(_CHANNELS, self._dof, self.attached, due, pulse_q18us, self._scale_q21, self._registers)
+            attached = self.attached
+            _fill(_CHANNELS, self._dof, attached, due, pulse_q18us, self._scale_q21, self._registers)
             if self.state != _RUNNING:
                 self._waits = self._waits or waits
             elif self._transfer(self._burst):
                 lock = self._board.lock()
                 if quiets == self._quiets:
+                    self.written = attached & self.attached
                     self.fresh = True
                 self._board.unlock(lock)
 
@@ -326,7 +331,9 @@ class Pca9685Driver(Driver):
     def load(self, tables):
         """Keep the pulses of channels that stay, on chips that stay as they are."""
         kept = 0
-        used = DRIVER_PCA9685 in tables.device_driver
+        used = False
+        for device in range(DEVICES_MAX):
+            used = used or tables.device_driver[device] == DRIVER_PCA9685
         if not used and not self._used:
             return 0
         self._used = used
@@ -398,7 +405,7 @@ class Pca9685Driver(Driver):
     def _enable(self):
         """Switch on the outputs of chips that have been written since they were off."""
         for device in range(DEVICES_MAX):
-            if self._chips[device].attached and self._chips[device].fresh and not self._enabled[device]:
+            if self._chips[device].written and not self._enabled[device]:
                 lock = self._board.lock()
                 self._switch()
                 self._board.unlock(lock)
@@ -414,10 +421,10 @@ class Pca9685Driver(Driver):
                     self._board.drive(oe, 1 - wanted)
 
     def _wanted(self, oe):
-        attached = 0
+        written = 0
         for chip in self._chips:
             if chip.oe == oe and chip.mask:
                 if not chip.fresh:
                     return 0
-                attached |= chip.attached
-        return 1 if attached else 0
+                written |= chip.written
+        return 1 if written else 0
