@@ -34,14 +34,14 @@ SMALL_INT_FUNCTIONS = (
     *methods("Puppet", "start", "stop", "prepare", "step", "_synthesise", "_rest"),
     *methods(
         "Motor", "exchange", "start", "stand", "put", "heard", "arm", "kill", "limit", "attach", "detach", "derive",
-        "attend", "_tick", "_tap", "_measure", "_stand", "_hold_unattached",
+        "attend", "_rearrange", "_tick", "_step", "_tap", "_stand", "_hold_unattached",
     ),
     *methods("Ring", "put", "rearrange"),
     *methods(
         "Trajectory", "hold", "stand_one", "prepare", "start", "put", "rearrange", "advance", "derive", "_next"
     ),
     *methods("Character", "stand", "rearrange", "respond"),
-    *methods("Feedback", "tick", "measured", "start", "forgive"),
+    *methods("Feedback", "pause", "tick", "_begin", "measured", "start", "forgive"),
     *methods(
         "Guards", "arm", "disarm", "attend", "_outputs", "_kept", "_queue", "_attach_next", "_attach", "_detach"
     ),
