@@ -167,7 +167,8 @@ class Guards:
             self._used_q15[d] = part[d] if d < dofs else 0
         for d in range(dofs):
             duty_q15 = tables.duty_q15[d]
-            self._budget_ms[d] = max(1, duty_q15 * (32768 - duty_q15) * tables.window_s[d] * 1000 >> 30)
+            if duty_q15 < 32768:
+                self._budget_ms[d] = max(1, duty_q15 * (32768 - duty_q15) * tables.window_s[d] * 1000 >> 30)
         self._slow_q24 = tables.motor_period_us * (1 << 14) // 1000000
         state = self._board.lock()
         if self.armed:  # still: an interrupt may have disarmed
@@ -247,7 +248,7 @@ class Guards:
         """Return bits of DOFs of the tables before, as bits of those that have become of them."""
         tables = self._motor.tables
         found = 0
-        for d in range(tables.dofs):
+        for d in range(tables.dofs if mask else 0):
             if tables.keep_dof[d] != NEW and mask & (1 << tables.keep_dof[d]):
                 found |= 1 << d
         return found
