@@ -19,6 +19,7 @@ from marotte import check, commands, curves, emulated
 from marotte.errors import MarotteError
 from marotte.files import Watch, load, load_pair
 from marotte.tomlfile import FileMistakes, did_you_mean
+from marotte.wiring import load_robot
 from shared import formats
 
 FINE = 0
@@ -59,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="marotte", description="Puppets that live on their own microcontroller, directed over a serial link."
     )
     commands_ = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_check, _add_render, _add_run, _add_save, _add_ports, _add_mcu, _add_import_curve):
+    for add in (_add_check, _add_render, _add_run, _add_save, _add_calibrate, _add_ports, _add_mcu, _add_import_curve):
         add(commands_)
     return parser
 
@@ -152,6 +153,28 @@ def _add_save(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--erase", action="store_true", help="forget what is kept, and keep nothing")
     _add_where(parser)
     parser.add_argument("--flash", type=Path, metavar="PATH", help=_FLASH_HELP)
+
+
+def _add_calibrate(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands_,
+        "calibrate",
+        "move one DOF of a robot by hand and set its pulses while it moves",
+        _calibrate,
+        "marotte calibrate puppets/pet-robot.toml NECK --port /dev/ttyACM0",
+        "    0              goes to the least value",
+        "    low 1040       and gets this pulse there, in us",
+        "    done           ends, and prints what belongs into the robot file",
+    )
+    parser.add_argument("robot", metavar="ROBOT", help="the robot file")
+    parser.add_argument("dof", metavar="DOF", help="the DOF of one of its outputs; the others stay off")
+    parser.add_argument(
+        "--relative",
+        action="store_true",
+        default=None,
+        help="it is a wheel (default: if its driver or keys are a wheel's)",
+    )
+    _add_where(parser)
 
 
 def _add_where(parser: argparse.ArgumentParser) -> None:
@@ -299,6 +322,16 @@ def _save(options: argparse.Namespace) -> int:
             return _failed(f"marotte: {options.puppet} has no behaviour {options.behaviour!r}{hint}", MISTAKE)
         what = commands.Keeping(puppet, robot, options.behaviour)
     commands.save(what, commands.Where(options.port, options.mcu or "", options.flash), Console())
+    return FINE
+
+
+def _calibrate(options: argparse.Namespace) -> int:
+    robot = load_robot(options.robot)
+    if options.dof not in robot.outputs:
+        hint = did_you_mean(options.dof, robot.outputs)
+        return _failed(f"marotte: {options.robot} has no output for {options.dof!r}{hint}", MISTAKE)
+    where = commands.Where(options.port, options.mcu or "")
+    commands.calibrate(robot, robot.outputs[options.dof], options.relative, where, Console())
     return FINE
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import queue
+import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -13,10 +16,12 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from marotte import ports
+from marotte.calibration import Calibration, CalibrationError
 from marotte.emulated import connected, open_mcu
 from marotte.errors import MarotteError
 from marotte.files import Files, Watch
 from marotte.link import Carrier, LinkError, VirtualCarrier
+from marotte.outputs import Output
 from marotte.ports import SerialCarrier
 from marotte.pulses import PulseSummary, measure
 from marotte.puppet import Puppet
@@ -24,6 +29,8 @@ from marotte.session import Session
 from marotte.tables import build_tables
 from marotte.view import View
 from marotte.wiring import Robot
+
+PUMP_US = 20_000
 
 
 def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console: Console) -> None:
@@ -120,15 +127,15 @@ def _save(what: Keeping | None, session: Session, name: str, console: Console) -
     session.stop()
     if what is None:
         session.erase_saved()
-        console.print(f"the flash of {name} keeps no puppet any more", highlight=False)
+        _say(console, f"the flash of {name} keeps no puppet any more")
         return
     tables = build_tables(what.puppet, what.robot)
     session.upload(tables)  # so that it is checked now, and not when the MCU is switched on
     session.save(tables, what.behaviour)
     does = f"does {what.behaviour}" if what.behaviour else "stands at rest"
     outputs = "its outputs are armed by themselves" if what.robot.autostart else "its outputs are off until it is armed"
-    console.print(f"{what.puppet.name} is kept on the flash of {name}", highlight=False)
-    console.print(f"switched on, it {does}; {outputs}", highlight=False)
+    _say(console, f"{what.puppet.name} is kept on the flash of {name}")
+    _say(console, f"switched on, it {does}; {outputs}")
 
 
 @dataclass(frozen=True)
@@ -152,6 +159,54 @@ def _carrier(where: Where) -> Iterator[tuple[Carrier, str]]:
     else:
         with open_mcu(where.mcu, where.flash) as virtual:
             yield VirtualCarrier(virtual), f"the emulated {where.mcu}"
+
+
+def calibrate(robot: Robot, output: Output, relative: bool | None, where: Where, console: Console) -> None:
+    """Let the user calibrate an output, command by command from standard input. Raises MarotteError."""
+    with contextlib.ExitStack() as stack:
+        if where.port:
+            url = name = where.port
+        else:
+            from marotte.mcu.serve import serve
+
+            virtual = stack.enter_context(open_mcu(where.mcu))
+            robot = connected(virtual, robot)
+            url, name = stack.enter_context(serve(virtual)).url, f"the emulated {where.mcu}"
+        carrier = stack.enter_context(contextlib.closing(SerialCarrier(url)))
+        try:
+            _calibrate(Session(carrier), robot, robot.outputs[output.dof], relative, console)
+        except LinkError as error:
+            raise LinkError(f"{name}: {error}") from error
+
+
+def _calibrate(session: Session, robot: Robot, output: Output, relative: bool | None, console: Console) -> None:
+    session.open()
+    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+    with Calibration(session, robot, output, relative) as calibration:
+        _say(console, f"{output.dof} at {output.drive.place} has its pulses. Commands: {calibration.commands}")
+        threading.Thread(target=_read_lines, args=(lines,), daemon=True).start()
+        while True:
+            session.pump(PUMP_US)
+            with contextlib.suppress(queue.Empty):
+                line = lines.get_nowait()
+                if line.strip() == "done":
+                    break
+                try:
+                    _say(console, calibration.do(line))
+                except CalibrationError as error:
+                    _say(console, str(error))
+    _say(console, f"{output.dof} is off. For the robot file:\n\n{calibration.text()}")
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _read_lines(lines: queue.SimpleQueue[str]) -> None:
+    """Hand on the lines of standard input, and at its end the command that ends."""
+    for line in sys.stdin:
+        lines.put(line)
+    lines.put("done")
 
 
 def serve_mcu(kind: str, tcp: int | None, image: Path | None, link: str, flash: Path | None) -> None:

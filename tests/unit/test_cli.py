@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 PET = str(ROOT / "puppets" / "pet.toml")
 SCORE = str(ROOT / "puppets" / "pet-score.toml")
 ROBOT = str(ROOT / "puppets" / "pet-robot.toml")
-COMMANDS = ("check", "render", "run", "save", "ports", "mcu")
+COMMANDS = ("check", "render", "run", "save", "calibrate", "ports", "mcu")
 
 
 @pytest.fixture
@@ -277,6 +277,17 @@ def test_save_hands_over_what_is_to_be_kept(run, monkeypatch, tmp_path):
     assert (what.puppet.name, what.robot.name, what.behaviour) == ("pet", "pet-1", "CALM")
     assert where == commands.Where(None, "rp2040", tmp_path / "f")
     assert (nothing, port.port) == (None, "/dev/ttyACM0")
+
+
+def test_calibrate_needs_an_output_of_the_robot(run):
+    expected = f"marotte: {ROBOT} has no output for 'NEK'; did you mean \"NECK\"?\n"
+    assert run("calibrate", ROBOT, "NEK", "--mcu", "unix") == (2, "", expected)
+
+
+def test_calibrate_says_what_is_wrong_with_a_port(run):
+    status, _, err = run("calibrate", ROBOT, "NECK", "--port", "/dev/ttyNOSUCH7")
+    assert status == 1
+    assert err.startswith("marotte: /dev/ttyNOSUCH7: ") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("options", [["--link", "uart"], ["--image", "x.uf2"]])
