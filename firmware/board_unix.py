@@ -13,7 +13,7 @@ from micropython import const
 from firmware.unix_time import VirtualTime
 
 _PINS = const(30)
-_KEPT = const(17)  # words: a tag, then a pose
+_KEPT = const(17)  # words: a tag, then a pose, each value beside its complement
 _BRIDGE_US = const(50)
 _NO_PIN = const(255)
 _UNDRIVEN = const(2)
@@ -39,7 +39,7 @@ class Board(VirtualTime):
         self._adc_q15 = 0
         self._present = set()
         self._kept_file = kept
-        self._kept = array("I", bytes(4 * _KEPT))
+        self._kept = array("H", bytes(4 * _KEPT))
         self._kept_changed = False
         self._tag = 0
         self._read_kept()
@@ -139,23 +139,25 @@ class Board(VirtualTime):
     def keep_pose(self, dofs, position_q24):
         """Keep a pose where a reset leaves it, to Q15, under the tag that `kept_pose` was last called with."""
         kept = self._kept
-        kept[0] = self._tag
+        kept[0] = self._tag & 0xFFFF
+        kept[1] = self._tag >> 16
         for d in range(dofs):
             value_q15 = (position_q24[d] + 256) >> 9
-            kept[d + 1] = value_q15 | (value_q15 ^ 0xFFFF) << 16
+            kept[2 * d + 2] = value_q15
+            kept[2 * d + 3] = value_q15 ^ 0xFFFF
         self._kept_changed = True
 
     def kept_pose(self, dofs, position_q24, tag):
         """Read the pose that was kept under a tag; return whether there was one. From now on poses are kept under it."""
         self._tag = tag
         kept = self._kept
-        if kept[0] != tag:
+        if kept[0] | kept[1] << 16 != tag:
             return False
         for d in range(dofs):
-            if (kept[d + 1] ^ kept[d + 1] >> 16) & 0xFFFF != 0xFFFF:
+            if kept[2 * d + 2] ^ kept[2 * d + 3] != 0xFFFF:
                 return False
         for d in range(dofs):
-            position_q24[d] = (kept[d + 1] & 0xFFFF) << 9
+            position_q24[d] = kept[2 * d + 2] << 9
         return True
 
     def heap_free(self):

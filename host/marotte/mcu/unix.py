@@ -18,7 +18,7 @@ from pathlib import Path
 
 from marotte.images import unix_binary
 from marotte.mcu import unix_process as unix
-from marotte.mcu.base import VirtualMcu
+from marotte.mcu.base import VirtualMcu, VirtualPca9685
 from marotte.mcu.pca9685 import CHANNELS, Pca9685Chip
 from marotte.mcu.pwm import Drive, Pins
 
@@ -250,7 +250,7 @@ class UnixMcu(VirtualMcu):
                     device.hear(at_us, data[1], data[2:])
 
 
-class UnixPca9685:
+class UnixPca9685(VirtualPca9685):
     """A PCA9685 on a bus of a `UnixMcu`."""
 
     def __init__(self, mcu: UnixMcu, bus: int, address: int, oe_pin: int | None, chip: Pca9685Chip):
@@ -261,22 +261,18 @@ class UnixPca9685:
         self._mcu = mcu
 
     def edges(self, channel: int) -> list[tuple[int, int]]:
-        """Changes of the level at output `channel` (0 to 15) since it was attached or `UnixMcu.clear_edges`."""
         if not 0 <= channel < CHANNELS:
             raise ValueError(f"channel must be 0 to {CHANNELS - 1}, not {channel!r}")
         return self.chip.edges(self._mcu.now_us, channel)
 
     def registers(self) -> bytes:
-        """All 256 registers as they are now, the number of a register being its index; of an absent chip, its last."""
         return self.chip.registers()
 
     def remove(self) -> None:
-        """Take the chip away from the bus and its supply, now: its outputs go low."""
         self.chip.set_power(self._mcu.now_us, False)
         self._mcu._tell_presence(self.bus)
 
     def put_back(self) -> None:
-        """Bring it back, with its registers as after power on: asleep, all outputs off."""
         self.chip.set_power(self._mcu.now_us, True)
         self._mcu._tell_presence(self.bus)
 
