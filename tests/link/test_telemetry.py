@@ -1,12 +1,15 @@
 """Telemetry: what comes how often, when none comes, and that a host which does not take it does not hold the motion up."""
 
 import itertools
+import struct
+from types import SimpleNamespace
 
 import pytest
 
 from marotte.link import VirtualCarrier, wire_packet
 from marotte.mcu.unix import UnixMcu
 from shared import formats, messages
+from tests.checked import load_checked
 from tests.link.stage import ALL_TAPS, FRAME_US, Parts, begin_performance, open_session, pet_tables
 
 DOFS = len(pet_tables().puppet.dofs)
@@ -205,3 +208,77 @@ def test_host_that_does_not_read_holds_the_motion_up_once(rp2040_mcu):
         assert status["frame"] - begun["frame"] == pytest.approx((mcu.now_us - begun_us) / FRAME_US, abs=1)
         assert status["late_max_us"] < BLOCKED_US
         assert status["late_frames"] <= BLOCKED_US / FRAME_US
+
+
+class Told:
+    """Telemetry of a puppet of one DOF whose taps are the frames' numbers, as far as the motor layer has come."""
+
+    def __init__(self):
+        self.out = bytearray(250)
+        self.frames = []
+        rings = [[0] * formats.FRAMES_KEPT * formats.DOFS_MAX for _ in range(2)]
+        self.motor = SimpleNamespace(silent=False, tapped=[-1], tap_q15=rings[1])
+        tables = SimpleNamespace(dofs=1)
+        self.puppet = SimpleNamespace(
+            frame=0, tables=tables, motor=self.motor, base_ring_q15=rings[0], signal_ring_q15=rings[0]
+        )
+        board = SimpleNamespace(heap_free=lambda: 0)
+        self.telemetry = load_checked("firmware/telemetry.py").Telemetry(board, self.puppet, self)
+
+    def send(self, message_id, length):
+        frame, taps, *values = struct.unpack(f"<iB{(length - 7) // 2}H", self.out[2:length])
+        assert (message_id, taps, values) == (messages.TAPS, 7, [frame, frame, frame])
+        self.frames.append(frame)
+
+    def step(self, tapped):
+        """Compute a frame, the motor layer having passed the instants up to `tapped`; return the frames then told."""
+        place = self.puppet.frame % formats.FRAMES_KEPT * formats.DOFS_MAX
+        self.puppet.base_ring_q15[place] = self.puppet.frame
+        for frame in range(self.motor.tapped[0] + 1, tapped + 1):
+            self.motor.tap_q15[frame % formats.FRAMES_KEPT * formats.DOFS_MAX] = frame
+        self.motor.tapped[0] = tapped
+        self.puppet.frame += 1
+        self.frames = []
+        self.telemetry.report()
+        return self.frames
+
+
+def test_taps_wait_for_the_motor_layer_and_catch_up_two_at_a_time():
+    told = Told()
+    told.telemetry.ask(ALL_TAPS, 1, 0)
+    told.telemetry.start()
+    assert [told.step(tapped) for tapped in (-1, -1, 0, 0, 4, 4, 5)] == [[], [], [0], [], [1, 2], [3, 4], [5]]
+
+
+def test_taps_that_were_overwritten_are_never_told():
+    told = Told()
+    told.telemetry.ask(ALL_TAPS, 1, 0)
+    told.telemetry.start()
+    assert [told.step(-1) for _ in range(20)] == [[]] * 20
+    assert told.step(19)[0] == 20 - 14
+    late = Told()  # frames that come when the motor layer has gone on without them
+    late.telemetry.ask(ALL_TAPS, 1, 0)
+    late.telemetry.start()
+    found = [frame for _ in range(40) for frame in late.step(30)]
+    assert found == list(range(30 - 14, 31))
+
+
+def test_taps_of_a_silence_are_not_told_after_it():
+    told = Told()
+    told.telemetry.ask(ALL_TAPS, 1, 0)
+    told.telemetry.start()
+    assert told.step(0) == [0]
+    told.motor.silent = True
+    assert [told.step(frame) for frame in range(1, 6)] == [[]] * 5
+    told.motor.silent = False
+    assert told.step(6) == [6]
+
+
+def test_taps_begin_anew_with_frame_0():
+    told = Told()
+    told.telemetry.ask(ALL_TAPS, 1, 0)
+    told.telemetry.start()
+    assert [told.step(frame) for frame in range(3)] == [[0], [1], [2]]
+    told.puppet.frame, told.motor.tapped[0] = 0, -1
+    told.telemetry.start()
+    assert [told.step(frame) for frame in range(3)] == [[0], [1], [2]]
