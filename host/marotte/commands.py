@@ -17,7 +17,7 @@ from rich.table import Table
 
 from marotte import ports
 from marotte.calibration import Calibration, CalibrationError
-from marotte.emulated import connected, open_mcu
+from marotte.emulated import connected, open_mcu, without_feedback
 from marotte.errors import MarotteError
 from marotte.files import Files, Watch
 from marotte.link import Carrier, LinkError, VirtualCarrier
@@ -90,6 +90,8 @@ def run_on_mcu(files: Files, mcu: str, options: RunOptions, console: Console) ->
         virtual = stack.enter_context(open_mcu(mcu))
         if files.robot:
             files = replace(files, robot=connected(virtual, files.robot))
+        if options.watch:
+            options.watch.adapt = without_feedback
         live = stack.enter_context(serve(virtual))
         carrier = SerialCarrier(live.url)
         try:

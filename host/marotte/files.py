@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from marotte import wiring
@@ -53,6 +54,8 @@ class Watch:
     """Loads the files of a performance again when one of them has changed, and been left alone since the last look."""
 
     def __init__(self, puppet: str | Path, score: str | Path, robot: str | Path | None = None) -> None:
+        self.adapt: Callable[[Robot], Robot] | None = None
+        """What to make of the robot that has been loaded, if anything."""
         self._paths = (puppet, score, robot)
         self._loaded = self._seen = self._look()
         self._looked_us: int | None = None
@@ -66,7 +69,8 @@ class Watch:
         if self._seen in (None, self._loaded) or self._seen != before:
             return None
         self._loaded = self._seen
-        return load(*self._paths)
+        files = load(*self._paths)
+        return replace(files, robot=self.adapt(files.robot)) if self.adapt and files.robot else files
 
     def _look(self) -> tuple[tuple[int, int], ...] | None:
         """Return time and size of each file; None while one is missing, as it is for a moment when an editor replaces it."""

@@ -9,6 +9,7 @@ from fractions import Fraction
 import pytest
 
 import marotte
+from marotte.emulated import without_feedback
 from marotte.files import LOOK_US, Files, Watch, load
 from marotte.link import LinkRefused, VirtualCarrier
 from marotte.mcu.unix import UnixMcu
@@ -247,6 +248,17 @@ def test_watch_waits_for_a_file_that_is_gone_for_a_moment(paths):
     paths[0].write_text(text + "\n[dof.C]\n")
     assert watch.changed(3 * LOOK_US) is None
     assert "C" in watch.changed(4 * LOOK_US).puppet.dofs
+
+
+def test_watch_adapts_the_robot_that_it_loads(paths, tmp_path):
+    robot = tmp_path / "robot.toml"
+    robot.write_text("[output.A]\npin = 2\nfeedback = { pin = 26, at = [0, 1] }\n")
+    watch = Watch(*paths, robot)
+    watch.adapt = without_feedback
+    rewrite(robot, robot.read_text() + "rate = 60\n")
+    assert watch.changed(0) is None
+    output = watch.changed(LOOK_US).robot.outputs["A"]
+    assert (output.feedback, output.rate_hz) == (None, 60)
 
 
 def test_watch_tells_a_mistake_once(paths):
