@@ -465,7 +465,6 @@ def test_stalled_dof_is_let_go_at_once_until_the_next_arm():
     at, what = motor.events(1)[-1]
     assert what == "detach" and at - begin_s <= SLOT_S + 0.003
     assert motor.guards.stalled == 2 and motor.guards.released & 2
-    motor.feedback.stalled = 0  # what it does without pulses
     motor.lead(1, 0.1)
     motor.run(1)
     motor.run(1, relaxing=True)
@@ -487,7 +486,9 @@ def test_exchange_keeps_who_is_armed_and_what_is_used():
     motor.dofs = [{"speed": 1.0, "keep": 2}, {"speed": 1.0}, {"speed": 1.0, "duty": 0.5, "window_s": 8, "keep": 0}]
     motor.tables = tables_of(motor.dofs, 0, 20000)
     motor.attached = 0b001
+    used_ms = motor.guards._used_ms[0]
     motor.guards.load()
+    assert used_ms > 1900 and list(motor.guards._used_ms[:3]) == [0, 0, used_ms]
     motor.run(0.1)
     assert (motor.guards.armed, motor.attached, motor.guards.released) == (0b101, 0b001, 0b100)
     motor.run(2)
