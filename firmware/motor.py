@@ -132,6 +132,8 @@ class Motor:
         self._seen_us = board.ticks_us()
         self.tick = self._tick  # bound once: binding allocates
         self._set_rates(tables)
+        self._course = self._steps(tables)
+        next(self._course)
         board.start_ticks(MOTOR_PERIOD_MAX_US, self.tick)
 
     # --- the main loop's side
@@ -178,6 +180,7 @@ class Motor:
             elif tables.relative[d]:
                 self.position_q24[d] = _STILL_Q24
             self._turn[d] = 0
+            self._correction_q24[d] = ZERO_Q24
             self._take_ends(d)
             self._stand(d)
         self._hold_unattached()
@@ -203,6 +206,7 @@ class Motor:
             self._take_over(tables)
             return
         self._paused = True
+        self.feedback.pause()
         self.tables = tables
         self._rearrange(before, tables, gather_words, gather_halves, scratch)
         self._take_over(tables)
@@ -315,7 +319,11 @@ class Motor:
             if start_q24 >= 0:
                 self.position_q24[dof] = start_q24
             self._stand(dof)
-            self.trajectory.stand_one(dof, self.position_q24[dof])
+            # The limiter adds the correction; the course begins without it.
+            led_q24 = self.position_q24[dof] - self._correction_q24[dof] + ZERO_Q24
+            led_q24 = min(max(led_q24, 0), POSITION_ONE)
+            self._character.stand(dof, led_q24)
+            self.trajectory.stand_one(dof, led_q24)
             self._held[dof] = 0
             self.attached |= 1 << dof
             ticks = tables.turns[dof] - 1 - self._turn[dof]
@@ -376,46 +384,66 @@ class Motor:
             return
         while self._missed:
             self._missed -= 1
-            self._step(tables)
-        self._step(tables)
+            next(self._course)
+        next(self._course)
         self._keep_wait -= 1
         if self._keep_wait <= 0:
             self._keep_wait = self._keep_ticks
             board.keep_pose(tables.dofs, self.position_q24)
         _measure(self._times_us, self._period_us, begun_us, board.ticks_us())
 
-    def _step(self, tables):
-        """Take every DOF one step further and write the outputs whose turn it is."""
-        dofs = tables.dofs
-        if self._starting:
-            self._starting -= 1
-            if self._starting == 0:
-                self.trajectory.start(dofs, self.position_q24)
-                self.playing = True
-                self.tapped[0] = -1
-                self._tap_part = -self._part - self._part // 2
-        resting = self.silent and tables.when_silent != SILENT_IDLE
-        self.trajectory.advance(dofs, self.playing, tables.rest_q15 if resting else None)
-        self._character.respond(dofs, self.trajectory.reference_q24)
-        self.feedback.tick(self.attached, self.position_q24, self._correction_q24)
-        # fmt: off
-        limiter.limit(
-            self._character.output_q24, self._correction_q24, self.reference_q24, self.position_q24, self.velocity_q24,
-            dofs, self._held, tables.relative, tables.limit_low_q24, tables.limit_high_q24, tables.speed_q24,
-            tables.accel_q24, self.silent or not self.playing, self._calm_q24,
+    # fmt: off
+    def _steps(self, tables):
+        """Take every DOF one step further and write the outputs whose turn it is, each time this is resumed.
+
+        A generator, because its names are bound once for a set of tables: looking one up costs 2 us on an RP2040, and there
+        are some sixty.
+        """
+        dofs, relative, turns = tables.dofs, tables.relative, tables.turns
+        low_q24, high_q24, speed_q24, accel_q24 = (
+            tables.limit_low_q24, tables.limit_high_q24, tables.speed_q24, tables.accel_q24
         )
-        if self.playing:
-            self._tap(dofs)
-        _remember(self.position_q24, self._before_q24, dofs)
-        due = calibration.calibrate(
-            self.position_q24, self._level_q24, self._pulse_q18us, dofs, tables.relative, self._end_q4us,
-            tables.end0_q4us, tables.end1_q4us, self._glide_q4us, tables.dead_q15, tables.top_q15, self._turn,
-            tables.turns,
-        ) & self.attached
-        # fmt: on
-        if due:
-            self._drivers.write(self._level_q24, self._pulse_q18us, due)
-            self._later |= due
+        end0_q4us, end1_q4us, dead_q15, top_q15 = (
+            tables.end0_q4us, tables.end1_q4us, tables.dead_q15, tables.top_q15
+        )
+        position_q24, velocity_q24, reference_q24 = self.position_q24, self.velocity_q24, self.reference_q24
+        before_q24, correction_q24, held = self._before_q24, self._correction_q24, self._held
+        level_q24, pulse_q18us, end_q4us, turn = self._level_q24, self._pulse_q18us, self._end_q4us, self._turn
+        course_q24, wanted_q24 = self.trajectory.reference_q24, self._character.output_q24
+        advance, respond, correct = self.trajectory.advance, self._character.respond, self.feedback.tick
+        limit, remember, calibrate, write = limiter.limit, _remember, calibration.calibrate, self._drivers.write
+        calm_q24, glide_q4us = self._calm_q24, self._glide_q4us
+        rest_q15 = tables.rest_q15 if tables.when_silent != SILENT_IDLE else None
+        while True:
+            yield
+            if self._starting:
+                self._starting -= 1
+                if self._starting == 0:
+                    self.trajectory.start(dofs, position_q24)
+                    self.playing = True
+                    self.tapped[0] = -1
+                    self._tap_part = -self._part - self._part // 2
+            playing = self.playing
+            silent = self.silent
+            attached = self.attached
+            advance(dofs, playing, rest_q15 if silent else None)
+            respond(dofs, course_q24)
+            correct(attached, position_q24, correction_q24)
+            limit(
+                wanted_q24, correction_q24, reference_q24, position_q24, velocity_q24, dofs, held, relative, low_q24,
+                high_q24, speed_q24, accel_q24, silent or not playing, calm_q24,
+            )
+            if playing:
+                self._tap(dofs)
+            remember(position_q24, before_q24, dofs)
+            due = attached & calibrate(
+                position_q24, level_q24, pulse_q18us, dofs, relative, end_q4us, end0_q4us, end1_q4us, glide_q4us,
+                dead_q15, top_q15, turn, turns,
+            )
+            if due:
+                write(level_q24, pulse_q18us, due)
+                self._later |= due
+    # fmt: on
 
     def _tap(self, dofs):
         """Note the course at the instants of frames that lie half a tick or more behind."""
@@ -441,7 +469,6 @@ class Motor:
         self.velocity_q24[dof] = ZERO_Q24
         self.reference_q24[dof] = position_q24 + ZERO_Q24
         self._before_q24[dof] = self._before_q24[_DOFS + dof] = position_q24
-        self._correction_q24[dof] = ZERO_Q24
         self._character.stand(dof, position_q24)
 
     def _hold_unattached(self):
@@ -466,6 +493,9 @@ class Motor:
         if tables.kill_pin != NO_PIN:
             self._board.input_pullup(tables.kill_pin)
         self._timeout_ticks = tables.link_timeout_ms * 1000 // tables.motor_period_us
+        course = self._steps(tables)
+        next(course)
+        self._course = course
 
     def _set_rates(self, tables):
         period_us = tables.motor_period_us
