@@ -143,8 +143,7 @@ export class Pca9685 {
     return SUBADDRESSES.some(([register, bit]) => registers[MODE1] & bit && registers[register] >> 1 === address);
   }
 
-  start(address, reads) {
-    if (reads) return;
+  start(address) {
     this.heard = address === GENERAL_CALL ? 'general call' : 'register';
   }
 

@@ -57,6 +57,16 @@ def test_adc_registers_convert_once(repl):
     assert int(repl.exec("print(convert(1))")) == code_of(0.3)
 
 
+def test_adc_starts_no_conversion_by_itself(repl):
+    # As the SDK does it: START_ONCE by the register's alias that sets bits, the channel by the one that flips them.
+    repl.exec(REGISTERS + "mem32[CS] = 1\nmem32[CS + 0x2000] = 4")
+    repl.mcu.set_adc(26, 0.4)
+    repl.mcu.set_adc(27, 0.7)
+    assert repl.exec("print(mem32[CS] & 4)") == "0\r\n"
+    repl.exec("mem32[CS + 0x1000] = 1 << 12")
+    assert repl.exec("print(mem32[RESULT])") == "0\r\n"
+
+
 def test_adc_is_ready_only_when_enabled(repl):
     repl.exec(REGISTERS)
     assert repl.exec("print(mem32[CS])") == "0\r\n"
