@@ -13,7 +13,7 @@ from firmware.puppet import Puppet
 from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
-_WATCHDOG_MS = 1000  # a main loop or motor ticks that stand still for so long reset the board
+_WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board; a USB write may take 1100
 
 
 def perform(board):
@@ -24,6 +24,8 @@ def perform(board):
     try:
         store.load(link.commands)
         gc.collect()
+        if puppet.frame >= 0:
+            puppet.start()  # again, as reading and collecting have taken their time
         board.watchdog(_WATCHDOG_MS)
         while not link.poll():
             motor.attend()

@@ -118,7 +118,7 @@ class Motor:
         self._missed = 0
         self._calm_q24 = 0
         self._glide_q4us = 0
-        self._timeout_ticks = 0
+        self._timeout_ticks = 1
         self._quiet_ticks = 0
         self._keep_ticks = 0
         self._keep_wait = 0
