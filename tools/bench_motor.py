@@ -1,7 +1,7 @@
 """What the motor layer costs, and how punctual it is while the main loop is as busy as a host can make it.
 
-A board of its own notes the chip's timer at the beginning and at the end of every motor tick, in the interrupt. Meanwhile the puppet
-plays, sends all telemetry in every frame, and is sent weight targets as fast as they are acknowledged.
+A board of its own notes the chip's timer at the beginning and at the end of every motor tick, in the interrupt. Meanwhile the
+puppet plays, sends all telemetry in every frame, and is sent weight targets as fast as they are acknowledged.
 """
 
 from __future__ import annotations

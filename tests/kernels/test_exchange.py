@@ -1,5 +1,7 @@
 """The exchange of tables: every state array is gathered by the list of old places; equal functions are found."""
 
+import itertools
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -33,20 +35,20 @@ def gathered(values, old, count, fresh):
 def test_words_go_where_their_owners_went(values, old, count, fresh, row):
     others = [[n] * COUNT for n in range(ROWS)]
     others[row] = values
-    found = words(sum(others, []))
+    found = words(list(itertools.chain(*others)))
     MODULE.gather_words(found, bytes(old), words([-1] * COUNT), count, fresh, row * COUNT)
     others[row] = gathered(values, old, count, fresh)
-    assert list(found) == sum(others, [])
+    assert list(found) == list(itertools.chain(*others))
 
 
 @given(lists_of(any_half), places, counts, any_half, rows)
 def test_halves_go_where_their_owners_went(values, old, count, fresh, row):
     others = [[n] * COUNT for n in range(ROWS)]
     others[row] = values
-    found = halves(sum(others, []))
+    found = halves(list(itertools.chain(*others)))
     MODULE.gather_halves(found, bytes(old), words([-1] * COUNT), count, fresh, row * COUNT)
     others[row] = gathered(values, old, count, fresh)
-    assert list(found) == sum(others, [])
+    assert list(found) == list(itertools.chain(*others))
 
 
 @given(places, *[lists_of(tempos_q16)] * 4, counts)
