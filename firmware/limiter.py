@@ -37,9 +37,10 @@ def limit(
 ):
     """Move every DOF by one tick towards what is wanted, within its limits.
 
-    `wanted`, `correction`, `reference` and `velocity` (per tick) are Q24 with 16 added. `reference` is what was wanted in the last
-    tick, within the range; this one's is written there. A DOF that is `held` stands still. `standing` not 0 lets relative DOFs come to a stand, by at most
-    `calm_q24` a tick. Limits: `low <= high` within 0..2^24, speed 1..2^24, accel 2..2^24.
+    `wanted`, `correction`, `reference` and `velocity` (per tick) are Q24 with 16 added. `reference` is what was wanted in the
+    last tick, within the range; this one's is written there. A DOF that is `held` stands still. `standing` not 0 lets
+    relative DOFs come to a stand, by at most `calm_q24` a tick. Limits: `low <= high` within 0..2^24, speed 1..2^24, accel
+    2..2^24.
     Bits: positions have 25, distances 26, `2 x / A` 26; `n (n + 1)` stays below 2^27, `A (n - 1)` below 2^26.
     """
     d = 0

@@ -76,10 +76,10 @@ def _measure(times_us: ptr32, period_us: int, begun_us: int, ended_us: int):
 class Motor:
     """The motor layer of one puppet on one board.
 
-    `tick` is the handler of the board's motor ticks. Per DOF: `position_q24` is where the layer has led it, `velocity_q24` what it
-    moved in the last tick, `reference_q24` where it would like to be (both with `ZERO_Q24` added). `attached` has the bit of every
-    DOF that has pulses. `tap_ring` holds the course at the instants of the last 16 frames, `tapped[0]` is the last of them.
-    `silent` tells that no packet has come for the puppet's `link_timeout`.
+    `tick` is the handler of the board's motor ticks. Per DOF: `position_q24` is where the layer has led it, `velocity_q24`
+    what it moved in the last tick, `reference_q24` where it would like to be (both with `ZERO_Q24` added). `attached` has
+    the bit of every DOF that has pulses. `tap_ring` holds the course at the instants of the last 16 frames, `tapped[0]` is
+    the last of them. `silent` tells that no packet has come for the puppet's `link_timeout`.
     """
 
     def __init__(self, board, drivers, tables):

@@ -206,7 +206,9 @@ def main() -> None:
         for cost in some:
             print(f"{cost.name:32}{cost.median_us:10.1f}{cost.greatest_us:10.1f}")
     ticks = measure_ticks(image.path)
-    print(f"\n{'motor ticks, link saturated':32}{'p50 us':>10}{'p99 us':>10}{'max us':>10}{'late p50':>10}{'p99':>6}{'max':>6}")
+    print(
+        f"\n{'motor ticks, link saturated':32}{'p50 us':>10}{'p99 us':>10}{'max us':>10}{'late p50':>10}{'p99':>6}{'max':>6}"
+    )
     for kind in ticks:
         took = "".join(f"{percentile(kind.took_us, share):10d}" for share in (0.5, 0.99, 1))
         late = "".join(f"{percentile(kind.late_us, share):{width}d}" for share, width in ((0.5, 10), (0.99, 6), (1, 6)))
