@@ -567,11 +567,15 @@ class Board:
         return max(_kept(_RESETS), 0)
 
     def keep_pose(self, dofs, position_q24):
-        """Keep a pose where a reset leaves it, to Q15, under the tag that `kept_pose` was last called with."""
-        _keep_pose(dofs, position_q24, self._tag)
+        """Keep a pose where a reset leaves it, to Q15, under the tag that `kept_pose` was last called with.
+
+        Before it was called, what a reset has left is not touched.
+        """
+        if self._tag:
+            _keep_pose(dofs, position_q24, self._tag)
 
     def kept_pose(self, dofs, position_q24, tag):
-        """Read the pose that was kept under a tag of 30 bits; return whether there was one. Poses are now kept under it."""
+        """Read the pose that was kept under a tag, 1 to 2^30 - 1; return whether there was one. Poses are now kept under it."""
         self._tag = tag
         if _tag() != tag:
             return False
