@@ -36,6 +36,7 @@ from shared.formats import (
 
 _DOFS = const(16)
 _MICRO = const(1000000)
+_COUNT_MASK = const(0x1FFFFFFF)  # of ticks: counting further would allocate
 _STILL_Q24 = const(0x800000)
 _CALM_PER_S = const(4)  # change of a wheel's speed when it has to stand: from full speed in 250 ms
 _GLIDE_US_PER_S = const(200)  # of pulse ends that are set anew
@@ -231,7 +232,7 @@ class Motor:
         self._character.rearrange(gather_words, keep, scratch, dofs)
         self.tap_ring.rearrange(gather_halves, keep, scratch, dofs, self.trajectory.newest)
         for d in range(dofs):
-            self._turn[d] = ((self.ticks - self._since) & TICKS_MASK) % tables.turns[d]
+            self._turn[d] = ((self.ticks - self._since) & _COUNT_MASK) % tables.turns[d]
             was = keep[d]
             if was >= before.dofs:
                 self.position_q24[d] = tables.rest_q15[d] << 9
@@ -255,7 +256,7 @@ class Motor:
         due_us = board.tick_due_us()
         self._starting = 1
         if ticks_diff(due_us, board.ticks_us()) < _AHEAD_US:
-            due_us = (due_us + self._period_us) & TICKS_MASK
+            due_us = (due_us - (TICKS_MASK - self._period_us) - 1) & TICKS_MASK  # the plain sum may pass 2^30
             self._starting = 2
         self.trajectory.prepare()
         self._times_us[0] = self._times_us[1] = 0
@@ -372,7 +373,7 @@ class Motor:
         board = self._board
         begun_us = board.ticks_us()
         tables = self.tables
-        self.ticks = (self.ticks + 1) & TICKS_MASK
+        self.ticks = (self.ticks + 1) & _COUNT_MASK
         if tables.kill_pin != NO_PIN and self.armed and board.level(tables.kill_pin) == tables.kill_level:
             self.kill(KILLED_BY_PIN)
         if self._quiet_ticks >= self._timeout_ticks:
