@@ -197,9 +197,9 @@ class Motor:
     def exchange(self, tables, gather_words, gather_halves, scratch):
         """Take over other tables while the motion goes on; `tables.keep_dof` says which DOF was which.
 
-        Outputs that are no longer used fall silent, new ones are attached one after the other. Frame rate and motor period are
-        the same. `gather_*(values, old, scratch, count, fresh, at)` rearrange an array. If the DOFs and their outputs stay as they
-        were, no tick waits for this; else ticks that come meanwhile, some 10 ms, are made up for by the next one.
+        Outputs that are no longer used fall silent, new ones are attached one after the other. Frame rate and motor period
+        are the same. `gather_*(values, old, scratch, count, fresh, at)` rearrange an array. If the DOFs and their outputs
+        stay as they were, no tick waits for this; else ticks that come meanwhile, some 10 ms, are made up for by the next.
         """
         before = self.tables
         if _same_dofs(tables, before):

@@ -41,6 +41,10 @@ _CTRL_C = const(3)
 _NEVER = const(-1)
 
 
+def _nothing():
+    """Be the handler of ticks that nobody wants."""
+
+
 class VirtualTime:
     """The part of the virtual board that knows what time it is. `commands` and `records` are binary files.
 
@@ -61,7 +65,7 @@ class VirtualTime:
         self._length_us = 0
         self._out = bytearray(_ROOM)
         self._used = 0
-        self._handler = None
+        self._handler = _nothing
         self._period_us = 0
         self._tick_at = _NEVER
         self._ticked = False
@@ -102,7 +106,7 @@ class VirtualTime:
     def stop_ticks(self):
         """Call the handler no more."""
         self._tick_at = _NEVER
-        self._handler = None
+        self._handler = _nothing
 
     def tick_due_us(self):
         """Return the instant of the next tick, as `ticks_us` counts."""
