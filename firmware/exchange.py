@@ -138,7 +138,7 @@ class Exchange:
             if keep[dof] == NEW:
                 puppet.base_q15[dof] = puppet.hold_q15[dof] = new.rest_q15[dof]
         puppet.cues.renumber(new.keep_action, new.actions, new.keep_live, new.lives)
-        puppet.base_ring.rearrange(gather_halves, keep, scratch, new.dofs, puppet.frame)
+        puppet.base_ring.rearrange(gather_halves, keep, scratch, new.dofs, puppet.frame, new.rest_q15)
         puppet.motor.exchange(new, gather_words, gather_halves, scratch)
         self._swap()
 

@@ -228,9 +228,9 @@ class Motor:
         for place in range(2):
             gather_words(self._before_q24, keep, scratch, dofs, 0, place * _DOFS)
             gather_halves(self._end_q4us, keep, scratch, dofs, 0, place * _DOFS)
-        self.trajectory.rearrange(gather_words, gather_halves, keep, scratch, dofs)
+        self.trajectory.rearrange(gather_words, gather_halves, keep, scratch, dofs, tables.rest_q15)
         self._character.rearrange(gather_words, keep, scratch, dofs)
-        self.tap_ring.rearrange(gather_halves, keep, scratch, dofs, self.trajectory.newest)
+        self.tap_ring.rearrange(gather_halves, keep, scratch, dofs, self.trajectory.newest, tables.rest_q15)
         for d in range(dofs):
             self._turn[d] = ((self.ticks - self._since) & _COUNT_MASK) % tables.turns[d]
             was = keep[d]

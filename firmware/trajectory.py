@@ -20,7 +20,7 @@ import micropython
 from micropython import const
 
 from firmware.tables import halves, words
-from shared.formats import DOFS_MAX, FRAMES_KEPT
+from shared.formats import DOFS_MAX, FRAMES_KEPT, NEW
 
 ZERO_Q24 = 1 << 28
 KNOTS = 4  # recent targets per DOF, the newest first
@@ -180,10 +180,14 @@ class Ring:
         """Store a frame's values."""
         _store(value_q15, self.value_q15, dofs, (frame & 15) * _DOFS)
 
-    def rearrange(self, gather_halves, keep, scratch, dofs, newest):
-        """Let the last few frames have other DOFs; those that were not there before are 0."""
+    def rearrange(self, gather_halves, keep, scratch, dofs, newest, rest_q15):
+        """Let the last few frames have other DOFs; those that were not there before were at rest."""
         for frame in range(newest - 3, newest + 1):
-            gather_halves(self.value_q15, keep, scratch, dofs, 0, (frame & 15) * _DOFS)
+            at = (frame & 15) * _DOFS
+            gather_halves(self.value_q15, keep, scratch, dofs, 0, at)
+            for d in range(dofs):
+                if keep[d] == NEW:
+                    self.value_q15[at + d] = rest_q15[d]
 
 
 class Trajectory:
@@ -252,12 +256,12 @@ class Trajectory:
         self.ring.put(frame, dofs, target_q15)
         self.newest = frame
 
-    def rearrange(self, gather_words, gather_halves, keep, scratch, dofs):
-        """Let other tables have other DOFs."""
+    def rearrange(self, gather_words, gather_halves, keep, scratch, dofs, rest_q15):
+        """Let other tables have other DOFs; new ones come from their rest."""
         for values in (self._knot, self._glide):
             for place in range(0, len(values), _DOFS):
                 gather_words(values, keep, scratch, dofs, ZERO_Q24, place)
-        self.ring.rearrange(gather_halves, keep, scratch, dofs, self.newest)
+        self.ring.rearrange(gather_halves, keep, scratch, dofs, self.newest, rest_q15)
 
     def advance(self, dofs, playing, rest_q15):
         """Take the step of one motor tick.
