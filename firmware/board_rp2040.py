@@ -53,6 +53,7 @@ _DIVIDER_BRIDGE = const(16)
 _BRIDGE_US = const(50)
 _BRIDGE_COUNTS = const(6250)
 _ALARM_SLACK_US = const(300)
+_SLEEP_US = const(1200)
 _WATCHDOG_MAX_MS = const(8000)
 _BURST_BITS = const(640)  # the longest I2C transfer, 66 bytes with their acknowledgements, and a little
 _POSES = const(1)  # words that a reset leaves as they are, after the tag
@@ -313,13 +314,13 @@ class Board:
         return time.ticks_us()
 
     def wait(self, longest_us):
-        """Sleep until a byte arrives or a motor tick has run, or until less than a millisecond of `longest_us` is left."""
+        """Sleep until a byte arrives or a motor tick has run, or until little more than a millisecond of `longest_us` is left."""
         ticks = self._ticks
         end_us = _later(time.ticks_us(), longest_us)
-        while ticks == self._ticks and ticks_diff(end_us, time.ticks_us()) > 1000:
+        while ticks == self._ticks and ticks_diff(end_us, time.ticks_us()) > _SLEEP_US:
             for _ in self._poll.ipoll(0):
                 return
-            machine.idle()  # until an interrupt, a millisecond at most
+            machine.idle()  # until an interrupt, for a millisecond at most
 
     def start_ticks(self, period_us, handler):
         """Call `handler` each `period_us` from now on, in interrupts, the first time in one period.

@@ -112,6 +112,8 @@ class BridgeDriver(Driver):
 
     def attach(self, dof, until_us):
         """Let a motor have PWM, at duty 0 until the next write."""
+        if self._attached >> dof & 1:
+            return
         board = self._board
         board.bridge_attach(self._pin_a[dof])
         if self._wiring[dof]:

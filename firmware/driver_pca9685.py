@@ -270,7 +270,7 @@ class Pca9685Driver(Driver):
         self._board = board
         self._chips = [_Chip(board) for _ in range(DEVICES_MAX)]
         self._enabled = bytearray(DEVICES_MAX)  # whether OE is low
-        self._used = False
+        self._used = False  # whether there is a chip
 
     def check_device(self, settings, count):
         """Return None, or the number of the setting that is missing, surplus or out of range."""
@@ -366,6 +366,8 @@ class Pca9685Driver(Driver):
 
     def flush(self, level_q24, pulse_q18us, due):
         """Send the pulse widths of the attached DOFs in `due`, chip by chip."""
+        if not self._used:
+            return
         for chip in self._chips:
             if chip.mask:
                 chip.flush(pulse_q18us, due)
@@ -373,6 +375,8 @@ class Pca9685Driver(Driver):
 
     def attend(self, now_us):
         """Set chips up, find those that have come back, and switch off what has been released."""
+        if not self._used:
+            return
         for chip in self._chips:
             if chip.mask:
                 chip.attend(now_us)
@@ -380,6 +384,8 @@ class Pca9685Driver(Driver):
 
     def quiet(self):
         """Take all pulses away, now: by OE, and from the chips' registers with the next `attend`."""
+        if not self._used:
+            return
         for device in range(DEVICES_MAX):
             chip = self._chips[device]
             if chip.oe != NO_PIN:

@@ -57,6 +57,8 @@ class PinsDriver(Driver):
 
     def attach(self, dof, until_us):
         """Give the DOF's pin to its PWM slice, which begins a period 1 ms after the DOF's next turn."""
+        if self._attached >> dof & 1:
+            return
         self._board.servo_attach(self._pin[dof], self._period_us[dof], until_us + _AFTER_TICK_US)
         self._attached |= 1 << dof
 

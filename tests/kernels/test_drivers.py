@@ -365,6 +365,17 @@ def test_servo_is_written_when_it_is_attached_and_due():
     outputs.tick(0b1111)
 
 
+@pytest.mark.parametrize("output", [(DRIVER_PINS, 10), (DRIVER_BRIDGE, 0, 10, 11, 0), (DRIVER_BRIDGE, 1, 10, 11, 0)])
+def test_output_that_is_attached_is_not_disturbed_by_being_attached(output):
+    outputs = Outputs(output)
+    outputs.level_q24[0] = 1 << 24
+    outputs.attach(0, until_us=7)
+    outputs.tick(1)
+    before = dict(outputs.board.attached), dict(outputs.board.duty)
+    outputs.attach(0, until_us=8)
+    assert (outputs.board.attached, outputs.board.duty) == before
+
+
 def test_servos_that_stay_go_on_and_the_others_fall_silent():
     outputs = Outputs((DRIVER_PINS, 2), (DRIVER_PINS, 3), (DRIVER_PINS, 7), (DRIVER_PINS, 8))
     assert outputs.kept == 0

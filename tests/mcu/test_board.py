@@ -209,7 +209,7 @@ board.close()
     board.mcu.run_for(300 * MS)
     board.mcu.send(b"x")
     told = [line.split() for line in board.repl.finish().splitlines()]
-    assert told[:4] == [["19"]] * 3 + [["99"]]
+    assert told[:4] == [["19"]] * 3 + [["98"]]
     received, after_ms = map(int, told[4])
     assert received == 1 and after_ms < 350
 
@@ -252,7 +252,7 @@ run(3)
         assert pulses_of(board.mcu.edges(pin))[0][0] // 1000 - due_us in AFTER_TICK_US
 
 
-@pytest.mark.parametrize("others", ["()", "(1,)"])
+@pytest.mark.parametrize("others", ["()", "(1,)"], ids=["all", "one"])
 def test_quiet_drives_all_pins_low_within_its_time_and_no_pulse_comes_back_cut(board, others):
     told = board(f"""
 play([(0, 2), (0, 3), (2, 1, 8, 9, 0), (2, 0, 10, 11, 0)])
@@ -275,7 +275,9 @@ for n in range(24):
         time.sleep_us(1234)
     attach(0, 1, 2, 3)
 run(5)
+before = time.ticks_us()
 drivers.quiet()
+print(time.ticks_us(), time.ticks_diff(time.ticks_us(), before))
 """)
     quiets = [tuple(map(int, line.split())) for line in told.splitlines()]
     if others == "()":
@@ -284,12 +286,13 @@ drivers.quiet()
             for pin in (2, 3, 8, 9, 10):
                 levels = [level for t_ns, level in board.mcu.edges(pin) if t_ns // 1000 <= done_us]
                 assert [0, *levels][-1] == 0
+    told_us = KILL_MAX_US + (0 if others == "()" else 500)  # from the end of a pulse to the end of what ended it
     for pin in (2, 3):
         pulses = pulses_of(board.mcu.edges(pin))
         ends_us = [done_us for done_us, _ in quiets]
         cut = [start for start, width in pulses if abs(width - 1_500_000) > COUNT_NS]
         for start in cut:
-            assert any(start // 1000 <= end_us <= start // 1000 + 1500 + KILL_MAX_US for end_us in [*ends_us, 1 << 40])
+            assert any(start // 1000 <= end_us <= start // 1000 + 1500 + told_us for end_us in ends_us)
         assert all(width <= 1_500_000 + COUNT_NS for _, width in pulses)
 
 
