@@ -57,7 +57,7 @@ def decided_case(seed, seconds):
 
 
 def assert_case_is_right(case, seconds, expected):
-    """Play a case, hold its taps against the definitions, the motor's against its range, and return its fractions of the bounds."""
+    """Play a case, hold its taps against the definitions, the motor tap against its range; return its fractions of the bounds."""
     rendering = play(case, seconds)
     base = tap(rendering, "base")
     assert numpy.array_equal(base, tap(rendering, "signal")), f"{case.name}: with all gains 1 the signal is the base"
