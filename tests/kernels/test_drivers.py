@@ -14,10 +14,8 @@ from tests.checked import load_checked
 from tests.kernels.values import halves, integers, words
 
 DRIVERS = load_checked("firmware/drivers.py", bytecode=("BridgeDriver._write", "BridgeDriver.write", "_Chip.flush"))
-BRIDGE = DRIVERS.BridgeDriver.__init__.__globals__
-PCA9685 = DRIVERS.Pca9685Driver.__init__.__globals__
-STEER = SimpleNamespace(_steer=BRIDGE["_steer"])
-FILL = SimpleNamespace(_fill=PCA9685["_fill"])
+BRIDGE = load_checked("firmware/driver_bridge.py")
+PCA9685 = load_checked("firmware/driver_pca9685.py")
 
 STOP_Q24 = 0x800000
 DOFS = formats.DOFS_MAX
@@ -402,7 +400,7 @@ def test_wheel_has_the_nearest_duty_and_turns_round_through_a_stand(levels, inve
     duty, backward = words([0]), bytearray(1)
     for level in levels:
         duty_before, backward_before = duty[0], backward[0]
-        STEER._steer(1, words([level]), bytes([invert]), 1, duty, backward)
+        BRIDGE._steer(1, words([level]), bytes([invert]), 1, duty, backward)
         speed = (STOP_Q24 - level if invert else level - STOP_Q24) / STOP_Q24
         wanted = int(abs(speed) * 65536 + 0.5)
         if duty_before and wanted and (speed < 0) != backward_before:
@@ -413,7 +411,7 @@ def test_wheel_has_the_nearest_duty_and_turns_round_through_a_stand(levels, inve
 
 def test_wheel_that_is_not_due_keeps_its_duty():
     duty, backward = words([7, 7, 7]), bytearray(3)
-    STEER._steer(3, words([1 << 24] * 3), bytes(3), 0b010, duty, backward)
+    BRIDGE._steer(3, words([1 << 24] * 3), bytes(3), 0b010, duty, backward)
     assert list(duty) == [7, 65536, 7]
 
 
@@ -490,12 +488,12 @@ def exact_scale(clock_khz, prescale):
     pulses_q18us,
 )
 def test_channel_is_high_for_the_nearest_number_of_counts(period_us, clock_khz, pulse_q18us):
-    prescale = PCA9685["prescale"](clock_khz, period_us)
+    prescale = PCA9685.prescale(clock_khz, period_us)
     exact = exact_scale(clock_khz, prescale)
     assert 3 <= prescale <= 255
     assert abs(4096 / exact - period_us) <= Fraction(1, 2) * 4096 * 1000 / clock_khz
     registers = bytearray(1 + 4 * 16)
-    FILL._fill(
+    PCA9685._fill(
         16, bytes([255, 5, *[255] * 14]), 1 << 5, 1 << 5, words([pulse_q18us] * 16), int(exact * (1 << 21)), registers
     )
     counts = registers[7] | registers[8] << 8
@@ -506,7 +504,7 @@ def test_channel_is_high_for_the_nearest_number_of_counts(period_us, clock_khz, 
 def test_channel_without_pulses_is_off_for_good_and_one_that_is_not_due_keeps_its_own():
     registers = bytearray([0xAA] * 65)
     dof = bytes([0, 1, 2, *[255] * 13])
-    FILL._fill(16, dof, 0b101, 0b100, words([1000 << 18] * 16), 1 << 20, registers)
+    PCA9685._fill(16, dof, 0b101, 0b100, words([1000 << 18] * 16), 1 << 20, registers)
     assert list(registers[:13]) == [0xAA] * 7 + [0, 0x10] + [0xAA] * 2 + [500 & 255, 500 >> 8]
 
 
