@@ -99,13 +99,14 @@ def test_wheel_stands_at_0_ends_at_its_top_speed_and_never_slows_down_on_the_way
 
 @given(st.lists(st.tuples(ends_q4us, ends_q4us, ends_q4us, ends_q4us), min_size=1, max_size=DOFS), st.integers(1, 64))
 def test_ends_that_are_set_anew_glide_there(outputs, glide):
-    found = Outputs([(0, 0, end0, end1, 0, 32768, 1) for end0, end1, *_ in outputs])
+    found = Outputs([(STILL, 0, end0, end1, 0, 32768, 1) for end0, end1, *_ in outputs])
     for d, (*_, new0, new1) in enumerate(outputs):
         found.end0[d], found.end1[d] = new0, new1
     for _ in range(5):
         before = list(found.now)
         found.tick(glide)
         for d, (*_, new0, new1) in enumerate(outputs):
+            assert found.pulse[d] / Q18 == (found.now[d] + found.now[DOFS + d]) / 32
             for place, new in ((d, new0), (DOFS + d, new1)):
                 moved = found.now[place] - before[place]
                 assert abs(new - found.now[place]) == max(0, abs(new - before[place]) - glide) and abs(moved) <= glide

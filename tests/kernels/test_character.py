@@ -141,7 +141,7 @@ def test_character_stays_in_32_bits_and_comes_to_rest_whatever_it_is_led_by(char
     for _ in range(60):
         jump = rng.choice((0.0, 1.0, -0.5, 1.5, rng.uniform(-0.5, 1.5)))
         for _ in range(rng.choice((1, 1, 2, 20))):
-            assert abs(dof.tick(jump)) <= 4
+            assert abs(dof.tick(jump)) <= 4 and abs(dof.rate) <= 8
     slowest = 2 * math.pi * f_hz * (zeta - math.sqrt(max(0, zeta * zeta - 1)))
     # Output and rate saturate a few times above 1; with r they are led there again by a last jump of 2.
     ticks = math.ceil(math.log(1e6) / slowest * 1e6 / period_us)
@@ -149,6 +149,13 @@ def test_character_stays_in_32_bits_and_comes_to_rest_whatever_it_is_led_by(char
         dof.tick(0.5)
     if ticks <= 2000:
         assert abs(dof.output - 0.5) < DEAD_ZONE
+
+
+def test_character_saturates_on_either_side():
+    for start, end, rate in ((0.0, 1.0, 8), (1.0, 0.0, -8)):
+        dof = Moved(2, 3, 4, formats.MOTOR_PERIOD_MIN_US, start)
+        dof.tick(end)
+        assert dof.rate == rate
 
 
 @pytest.mark.parametrize(("f_hz", "zeta", "r"), CORNERS)

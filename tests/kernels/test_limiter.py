@@ -209,6 +209,17 @@ def test_target_that_comes_to_rest_while_the_dof_moves_is_reached_in_the_least_t
         assert_reaches(dof, goal, dof.velocity)
 
 
+@pytest.mark.parametrize("accel", [2, 3, 7])
+def test_slowest_braking_takes_thousands_of_ticks_and_is_exact(accel):
+    # The greatest velocity from which the whole range is enough to stop: n ticks of braking cover A * n * (n + 1) / 2.
+    ticks = math.isqrt(2 * ONE // accel) - 1
+    dof = Limited(0, 0, ONE, ONE, accel)
+    dof.place(0, 0, accel * ticks)
+    for _ in range(ticks + 50):
+        assert_within(dof, dof.tick(ONE))
+    assert dof.position <= ONE and dof.velocity < accel * 60
+
+
 def test_step_takes_the_time_of_the_trapezoid():
     # 10 a second and 200 a second squared at 50 Hz: 0.05 s to full speed and again to brake; 0.1 s in all for half the range.
     dof = Limited(0, 0, ONE, ONE // 5, ONE * 200 // 2500)

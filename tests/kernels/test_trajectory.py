@@ -283,6 +283,18 @@ def test_targets_that_are_followed_are_passed_exactly():
     assert (knots * 32768 == signal[: len(knots)]).all()
 
 
+@pytest.mark.parametrize("frame_rate", [10, 60])
+def test_offset_dies_out_without_a_last_step(frame_rate):
+    course = made(frame_rate, 20_000, [ONE_Q24])
+    offsets = []
+    for _ in range(8 * frame_rate):
+        next_knots(course, 1, halves([0]), halves([0]), False)
+        offsets.append(course._knot[0])
+    last = max(n for n, offset in enumerate(offsets) if offset)
+    assert offsets == sorted(offsets, reverse=True) and last < 8 * frame_rate - 1
+    assert offsets[last] < SNAP * ONE_Q24 * 2
+
+
 def test_dof_that_is_held_stands_until_it_is_let_go():
     course = made(50, 3_008, [ONE_Q24 // 3] * 2)
     found = []
