@@ -138,6 +138,8 @@ class Board(VirtualTime):
 
     def keep_pose(self, dofs, position_q24):
         """Keep a pose where a reset leaves it, to Q15, under the tag that `kept_pose` was last called with."""
+        if self._tag == 0:  # no robot yet: what a reset has left stays
+            return
         kept = self._kept
         kept[0] = self._tag & 0xFFFF
         kept[1] = self._tag >> 16

@@ -28,17 +28,15 @@ def perform(board):
             puppet.start()  # again, as reading and collecting have taken their time
         board.watchdog(_WATCHDOG_MS)
         while not link.poll():
+            if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0:
+                puppet.step()
+                link.report()
             motor.attend()
             longest_us = min(_IDLE_US, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
             if puppet.frame >= 0:
-                due_us = puppet.clock.until_us(board.ticks_us())
-                if due_us <= 0:
-                    puppet.step()
-                    link.report()
+                longest_us = min(longest_us, puppet.clock.until_us(board.ticks_us()))
+                if longest_us <= 0 or puppet.prepare():
                     continue
-                if puppet.prepare():
-                    continue
-                longest_us = min(longest_us, due_us)
             board.wait(longest_us)
     finally:
         motor.kill(KILLED_BY_HOST)

@@ -45,6 +45,7 @@ from shared.formats import (
     POSITION_BITS,
     POSITION_ONE,
     PULSE_BITS,
+    PULSE_GAP_US,
     PULSE_MAX_US,
     PULSE_MIN_US,
     PWM_PERIOD_MAX_US,
@@ -373,7 +374,7 @@ class Tables:
             return 1
         if not 1 <= turns <= TURNS_MAX or turns * self.motor_period_us > PWM_PERIOD_MAX_US:
             return 2
-        bad = self._bad_calibration(driver, end0_q4us, end1_q4us, dead_q15, top_q15)
+        bad = self._bad_calibration(driver, turns, end0_q4us, end1_q4us, dead_q15, top_q15)
         if bad is not None:
             return 3 + bad
         if count > SETTINGS_MAX:
@@ -400,11 +401,14 @@ class Tables:
         """Return the number of the bad field of a new calibration for a DOF, or None; stores nothing. Allocates nothing."""
         if dof >= self._dofs_seen or self.driver[dof] == NO_DRIVER:
             return 0
-        bad = self._bad_calibration(self.driver[dof], end0_q4us, end1_q4us, dead_q15, top_q15)
+        bad = self._bad_calibration(self.driver[dof], self.turns[dof], end0_q4us, end1_q4us, dead_q15, top_q15)
         return None if bad is None else 1 + bad
 
-    def _bad_calibration(self, driver, end0_q4us, end1_q4us, dead_q15, top_q15):
-        least, most = (0, 0) if driver == DRIVER_BRIDGE else (_PULSE_MIN_Q4US, _PULSE_MAX_Q4US)
+    def _bad_calibration(self, driver, turns, end0_q4us, end1_q4us, dead_q15, top_q15):
+        least = most = 0
+        if driver != DRIVER_BRIDGE:
+            least = _PULSE_MIN_Q4US
+            most = min(_PULSE_MAX_Q4US, (turns * self.motor_period_us - PULSE_GAP_US) << PULSE_BITS)
         if not least <= end0_q4us <= most:
             return 0
         if not least <= end1_q4us <= most:

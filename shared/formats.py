@@ -64,6 +64,7 @@ STORE_MAX = 48 * 1024  # bytes kept on the MCU's flash
 
 PULSE_MIN_US = 300
 PULSE_MAX_US = 3000
+PULSE_GAP_US = 200  # what a pulse leaves of its period at least
 SERVO_PERIOD_US = 20000
 
 # Function codes of a mapping. Its `argument` is, in this order: nothing, nothing, the noise table 0..15, a value_q15, a

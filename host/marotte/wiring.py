@@ -171,9 +171,9 @@ def _check_together(table: Table, output: Output, robot: Robot, plan: PinPlan) -
     if output.feedback:
         plan.take(table.table("feedback"), "pin", output.feedback.pin, f"measures {output.dof}")
     longest_us = max(output.ends_us)
-    if output.drive.has_pulses and longest_us >= period_us:
+    if output.drive.has_pulses and longest_us > min(period_us, robot.written_us(output)) - formats.PULSE_GAP_US:
         table.mistake(
             f"the pulses are up to {longest_us:g} us long, but begin every {period_us:g} us; "
-            "expected shorter ones, or a lower rate",
+            f"expected ones that leave {formats.PULSE_GAP_US} us, or a lower rate",
             "pulse_us",
         )

@@ -287,6 +287,18 @@ def test_calibration_is_checked_against_the_driver():
     assert tables.bad_calibration(0, 0, 32000, 0, 32768) == 2
 
 
+def test_a_pulse_leaves_a_gap_in_its_period():
+    tables = loaded(driver=formats.DRIVER_PINS)
+    tables.motor_period_us = 3008
+    most_q4us = (tables.turns[0] * 3008 - formats.PULSE_GAP_US) << 4
+    assert tables.turns[0] == 1 and most_q4us < formats.PULSE_MAX_US << 4
+    assert tables.bad_calibration(0, most_q4us, most_q4us, 0, 32768) is None
+    assert tables.bad_calibration(0, most_q4us + 1, 16000, 0, 32768) == 1
+    assert tables.bad_calibration(0, 16000, most_q4us + 1, 0, 32768) == 2
+    tables.turns[0] = 2
+    assert tables.bad_calibration(0, most_q4us + 1, formats.PULSE_MAX_US << 4, 0, 32768) is None
+
+
 def test_feedback_inputs_are_used_once_and_not_by_the_kill_pin():
     tables = MODULE.Tables()
     tables.begin(*BEGIN.values())
