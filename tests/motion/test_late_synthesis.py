@@ -26,7 +26,7 @@ END0_US, END1_US = 500, 2500
 BLOCK_US = 200_000
 Q15 = 2.0**-15
 ALL_TAPS = formats.TAP_BASE | formats.TAP_SIGNAL | formats.TAP_MOTOR
-RATES = [(10, 50), (30, 50), (30, 333), (47, 100), (60, 333)]
+RATES = [(10, 50), (30, 50), (60, 50), (30, 333), (47, 100), (60, 333)]
 WIDE = {"range": [0.0, 1.0], "speed": 50, "accel": 1000}
 
 
@@ -119,7 +119,7 @@ def perform(frame_rate, rate_hz, at_s, block_us=BLOCK_US, limits=WIDE, seconds=9
 
 def expected_taps(blocked, frame_rate, tick_us):
     """Return the motor taps that the late frames lead to, and those that would be without any."""
-    frames = len(blocked.signal) - 2
+    frames = len(blocked.signal) - 4  # for the last ones the ticks behind them would be needed
     ticks = math.floor((len(blocked.signal) - 1) * 1e6 / frame_rate / tick_us)
     found = []
     for late in (blocked.late, ()):
