@@ -206,7 +206,7 @@ def _random_character(rng):
 
 
 def _random_servo(rng, pin, rate_hz):
-    low_us, high_us = rng.choice(((1000, 2000), (600.5, 2700), sorted(rng.uniform(600, 2700) for _ in range(2))))
+    low_us, high_us = rng.choice(((1000, 2000), (600.5, 2500), sorted(rng.uniform(600, 2500) for _ in range(2))))
     servo = {
         "pin": pin,
         "pulse_us": [round(low_us, 3), round(high_us, 3)],

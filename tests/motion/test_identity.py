@@ -33,13 +33,13 @@ TIMER_COUNT_US = 0.32
 BRIDGE_US = 50
 BRIDGE_COUNT_US = 0.008
 AFTER_TICK_US = 1000
-"""A servo's period begins so long after the tick that has written its pulse, at least."""
+"""A servo's period begins so long after the tick that has written its pulse, and what it takes to start a PWM slice."""
 
-GRID_US = 600
-"""How much longer than that it may take: what the firmware needs to start a PWM slice."""
+WRITTEN_US = 2200
+"""After so long a tick has written what it has to write, and before the next one."""
 
-LOW_MIN_US = 200
-"""A pin is low for so long in each period."""
+BUSY_ACTIONS, BUSY_RATE_HZ, CALM_RATE_HZ = 30, 50, 120
+"""An RP2040 is in time with 30 actions at 50 frames a second and quick ticks; with more it is with slower ones."""
 
 
 class Played(NamedTuple):
@@ -61,7 +61,12 @@ def identity_cases():
     cases = []
     for seed in SEEDS:
         case = random_case(seed, SECONDS)
-        cases.append(case._replace(robot=random_robot(random.Random(-seed), case.puppet)))
+        robot = random_robot(random.Random(-seed), case.puppet)
+        if len(case.puppet["action"]) > BUSY_ACTIONS or case.puppet.get("frame_rate", 30) > BUSY_RATE_HZ:
+            for rated in (robot, *robot["output"].values()):
+                if "rate" in rated:
+                    rated["rate"] = min(rated["rate"], CALM_RATE_HZ)
+        cases.append(case._replace(robot=robot))
     named = (
         "everything at once",
         "fastest phases",
@@ -106,6 +111,8 @@ def in_each_tick(robot):
 @pytest.mark.parametrize("number", range(len(CASES)), ids=[case.name for case in CASES])
 def test_renderings_are_identical_to_the_bit_on_all_mcus(played, number):
     renderings = played[number].result().renderings
+    late = [rendering.status["late_frames"] for rendering in renderings.values()]
+    assert not any(late), "the motor layer had to guess"
     for name in TAPS:
         expected = tap(renderings["unix"], name)
         for kind in ("reference", "unix32", "rp2040"):
@@ -132,49 +139,45 @@ def test_pulses_written_are_identical_on_both_pcs(played, number):
 @pytest.mark.parametrize("number", range(len(SEEDS)), ids=[case.name for case in CASES[: len(SEEDS)]])
 def test_pulses_on_the_pins_are_those_that_the_motor_layer_has_written(played, number):
     _, robot, _, drives, edges = played[number].result()
+    if not robot.outputs:
+        pytest.skip("this robot has no outputs")
     period_us = robot.motor_period_us
-    courses = {}  # by pin: ticks, widths, tolerance
+    written = written_by_tick(drives["reference"], period_us)
     base_us = None
     for output in robot.outputs.values():
         pin = output.drive.pulse_pin
         if pin is None:
             continue
         found = pulses(edges[pin])
-        rises_us = numpy.array([pulse.start_ns / 1000 for pulse in found]) - AFTER_TICK_US
-        base_us = rises_us[0] if base_us is None else base_us
-        ticks = numpy.rint((rises_us - base_us) / period_us).astype(int)
-        assert numpy.abs(rises_us - base_us - ticks * period_us).max() < GRID_US, (
-            f"{output.dof}: pulses beside the ticks"
-        )
-        assert (numpy.diff(ticks) == robot.turns(output)).all(), f"{output.dof}: pulses are missing"
-        longest_us = robot.written_us(output) - LOW_MIN_US
+        rises_us = numpy.array([pulse.start_ns / 1000 for pulse in found])
+        base_us = rises_us[0] - AFTER_TICK_US if base_us is None else base_us
+        assert numpy.allclose(numpy.diff(rises_us), robot.written_us(output), rtol=0, atol=0.001), f"pin {pin}"
+        ticks = numpy.arange(len(found)) * robot.turns(output)
         widths_us = numpy.array([pulse.width_ns / 1000 for pulse in found])
-        courses[pin] = ticks, widths_us, longest_us, TIMER_COUNT_US
-    if base_us is None:
-        pytest.skip("this robot has no servo")
+        assert_follows(pin, ticks, widths_us, written[pin], TIMER_COUNT_US)
     for output in robot.outputs.values():
-        if output.drive.pulse_pin is None and robot.turns(output) == 1:
-            for pin in bridge_pins(output, drives["reference"]):
-                ticks, widths_us = duties(edges[pin], base_us, period_us)
-                courses[pin] = ticks, widths_us, BRIDGE_US, BRIDGE_COUNT_US
-    written = written_by_tick(drives["reference"], period_us)
-    shift = best_shift(courses, written)
-    for pin, (ticks, widths_us, longest_us, tolerance_us) in courses.items():
-        places = ticks + shift
-        known = (places < len(written[pin])) & (ticks >= 0)
-        assert known.sum() * period_us > 0.8 * SECONDS * 1e6 / max(1, numpy.diff(ticks).max(initial=1))
-        expected_us = numpy.minimum(written[pin][places[known].clip(0)], longest_us)
-        errors_us = numpy.abs(widths_us[known] - expected_us)
-        worst = errors_us.argmax()
-        assert errors_us[worst] <= tolerance_us, (
-            f"pin {pin}, tick {ticks[known][worst]}: {widths_us[known][worst]:.3f} us long, expected {expected_us[worst]:.3f}; "
-            f"{(errors_us > tolerance_us).sum()} of {len(errors_us)} are wrong"
-        )
+        if output.drive.pulse_pin is None and base_us is not None and robot.turns(output) == 1:
+            for pin in set(output.drive.pins) & set(written):
+                widths_us = duties(edges[pin], base_us, period_us)
+                assert_follows(pin, numpy.arange(len(widths_us)), widths_us, written[pin], BRIDGE_COUNT_US)
 
 
-def bridge_pins(output, drives):
-    """Return the PWM pins of a bridge."""
-    return [pin for pin in output.drive.pins if pin in drives]
+def assert_follows(pin, ticks, widths_us, expected_us, tolerance_us):
+    """Assert that the widths found after some ticks are those expected, which may begin any number of ticks later or earlier.
+
+    Before the first that is expected stands what the pin has while nothing moves.
+    """
+
+    def wrong(shift):
+        places = (ticks + shift).clip(0, None)
+        known = places < len(expected_us)
+        return numpy.abs(widths_us[known] - expected_us[places[known]]) > tolerance_us
+
+    span = ticks[-1] // 4
+    fewest = min((wrong(shift) for shift in range(-span, span)), key=lambda off: (off.sum(), -len(off)))
+    assert len(fewest) > 0.7 * len(ticks)
+    first = numpy.flatnonzero(fewest)[:1]
+    assert not fewest.any(), f"pin {pin}: {fewest.sum()} of {len(fewest)} pulses are wrong, the first is number {first}"
 
 
 def written_by_tick(drives, period_us):
@@ -192,30 +195,15 @@ def written_by_tick(drives, period_us):
     return written
 
 
-def best_shift(courses, written):
-    """Return by how many ticks the pins are behind what was written, so that most of the pulses fit."""
-    longest = max(len(course[0]) for course in courses.values()) + max(len(widths) for widths in written.values())
-
-    def misfits(shift):
-        wrong = 0
-        for pin, (ticks, widths_us, longest_us, tolerance_us) in courses.items():
-            places = (ticks + shift).clip(0, len(written[pin]) - 1)
-            wrong += (numpy.abs(widths_us - numpy.minimum(written[pin][places], longest_us)) > tolerance_us).sum()
-        return wrong, abs(shift)
-
-    return min(range(-longest, longest), key=misfits)
-
-
 def duties(edges, base_us, period_us):
-    """Return the ticks and how long a bridge's pin was high in the last period before the next tick."""
+    """Return for each tick from `base_us` on how long a bridge's pin was high in a period of the bridge after it."""
     t_us = numpy.array([t_ns / 1000 for t_ns, _ in edges])
     levels = numpy.array([level for _, level in edges])
     high_us = numpy.concatenate([[0], numpy.cumsum(numpy.diff(t_us) * levels[:-1])])
-    ticks = numpy.arange(int((t_us[-1] - base_us) // period_us))
-    ends_us = base_us + (ticks + 1) * period_us - BRIDGE_US / 2
+    ends_us = numpy.arange(base_us + min(WRITTEN_US - AFTER_TICK_US, period_us), t_us[-1], period_us)
 
     def high_until(at_us):
         place = numpy.searchsorted(t_us, at_us, side="right") - 1
         return numpy.where(place < 0, 0, high_us[place] + (at_us - t_us[place]) * levels[place])
 
-    return ticks, high_until(ends_us) - high_until(ends_us - BRIDGE_US)
+    return high_until(ends_us) - high_until(ends_us - BRIDGE_US)
