@@ -12,9 +12,9 @@ from marotte.link import LinkRefused, VirtualCarrier
 from marotte.mcu.raw_repl import RawRepl
 from marotte.mcu.unix import UnixMcu
 from marotte.pulses import pulses
-from marotte.tables import build_tables
+from marotte.tables import build_tables, keeps
 from shared import formats
-from tests.link.stage import open_session
+from tests.link.stage import begin_performance, open_session, pet_tables
 
 PUPPET = """
 frame_rate = 50
@@ -237,6 +237,36 @@ def test_kill_acts_within_20_ms_and_a_tick_whatever_else_is_under_way(playing):
         session.flush()
         assert not session.status()["armed"]
     print(f"{mcu.kind}: kill among 16 long packets to the last edge {latest_us / 1000:.2f} ms at most")
+
+
+def test_kill_acts_within_20_ms_and_a_tick_while_tables_are_exchanged(mcu):
+    """The pet, ten servos at 333 Hz, is exchanged for itself; the kill comes early or late in that, or with the commit."""
+    pet = pet_tables()
+    tables = build_tables(pet.puppet, dataclasses.replace(pet.robot, rate_hz=333))
+    pins = [output.drive.pin for output in tables.robot.outputs.values()]
+    mcu.set_pin(KILL_PIN, 1)
+    session = begin_performance(mcu, 0)
+    session.upload(tables)
+    session.start()
+    first, *parts = tables.messages()
+    commit = parts.pop()
+    parts = [first, *parts, *keeps(tables.puppet, tables.puppet), commit]
+    delays_us = []
+    for number in range(12):
+        session.arm()
+        session.wait_attached()
+        for name, fields, items in parts:
+            session.link.post(name, fields, items, on_refused=lambda *_: None)
+        play(session, 12_000 + 27_000 * number)
+        session.kill()
+        begun_us = mcu.now_us
+        play(session, 1_500_000)
+        assert all(mcu.edges(pin)[-1][1] == 0 for pin in pins)
+        delays_us.append(max(mcu.edges(pin)[-1][0] / 1000 for pin in pins) - begun_us)
+        mcu.clear_edges()
+        assert not session.status()["armed"]
+    print(f"{mcu.kind}: kill while tables are exchanged to the last edge {max(delays_us) / 1000:.2f} ms at most")
+    assert max(delays_us) <= KILL_US + 3_008
 
 
 @pytest.mark.parametrize("rate", [50, 333])
