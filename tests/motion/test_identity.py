@@ -142,7 +142,7 @@ def test_pulses_on_the_pins_are_those_that_the_motor_layer_has_written(played, n
     if not robot.outputs:
         pytest.skip("this robot has no outputs")
     period_us = robot.motor_period_us
-    written = written_by_tick(drives["reference"], period_us)
+    written = written_by_tick(drives["reference"], period_us, robot)
     base_us = None
     for output in robot.outputs.values():
         pin = output.drive.pulse_pin
@@ -180,18 +180,21 @@ def assert_follows(pin, ticks, widths_us, expected_us, tolerance_us):
     assert not fewest.any(), f"pin {pin}: {fewest.sum()} of {len(fewest)} pulses are wrong, the first is number {first}"
 
 
-def written_by_tick(drives, period_us):
+def written_by_tick(drives, period_us, robot):
     """Return the widths in microseconds that were in force after each tick, arrays by pin.
 
-    They begin at one tick, before which each pin has the first width that it gets at all.
+    They begin at one tick. Until its first width a servo's pin counts as if it had that already, a bridge's as low.
     """
+    servo_pins = {output.drive.pulse_pin for output in robot.outputs.values()}
     first_us = min(drive.t_us[0] for drive in drives.values())
     last_us = max(drive.t_us[-1] for drive in drives.values())
     ticks = numpy.arange(first_us, last_us + 1, period_us)
     written = {}
     for pin, drive in drives.items():
         places = numpy.searchsorted(numpy.array(drive.t_us), ticks, side="right") - 1
-        written[pin] = numpy.array(drive.value)[places.clip(0)] / (1 << 18)
+        widths_us = numpy.array(drive.value) / (1 << 18)
+        before_us = widths_us[0] if pin in servo_pins else 0
+        written[pin] = numpy.where(places < 0, before_us, widths_us[places.clip(0)])
     return written
 
 
