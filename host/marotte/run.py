@@ -107,11 +107,13 @@ class _Play:
         length_s = default_seconds(self.files.score) if self._seconds is None else self._seconds
         return self.scene.frame >= round(length_s * self.files.puppet.frame_rate_hz) - 1
 
-    def begin(self) -> None:
+    def begin(self, again: bool = False) -> None:
         """Send the first steps and start the motion, so that the cues of frame 0 act in frame 0."""
         self._ask_for_telemetry(self.files.puppet)
         self._prompter.reached(-1)
-        if self._arm:
+        if again:
+            self._arm_again()
+        elif self._arm:
             self.session.arm()
         self.session.start()
 
@@ -169,7 +171,7 @@ class _Play:
         self.session.taps.clear()
         self._take(files)
         self._prompter = Prompter(self.session, self._steps, self.session.welcome["queue_max"])
-        self.begin()
+        self.begin(again=True)
 
     def _go_on_with(self, files: Files) -> None:
         """Bring what has been exchanged to where the new score stands."""
@@ -185,8 +187,12 @@ class _Play:
         tempos = {files.puppet.action_index(name): files.puppet.actions[name].tempo for name in cued}
         steps = [replace(now, tempos={**tempos, **now.tempos}), *later]
         self._prompter = Prompter(self.session, steps, self.session.welcome["queue_max"])
-        if self._arm:
-            self.session.arm()  # for outputs that are new
+        self._arm_again()  # for outputs that are new
+
+    def _arm_again(self) -> None:
+        """Arm after an exchange; yet what somebody has killed stays so, whatever is saved in a file."""
+        if self._arm and self.session.status()["killed_by"] == formats.KILLED_BY_NOBODY:
+            self.session.arm()
 
     def _ask_for_telemetry(self, puppet: Puppet) -> None:
         self.session.telemetry(formats.TAP_MOTOR, _every(puppet, REFRESH_HZ), _every(puppet, WEIGHTS_HZ))
