@@ -245,7 +245,10 @@ class Motor:
             elif self.attached >> was & 1:
                 attached |= going_on & 1 << d
         state = self._board.lock()
-        self.attached = attached if self.armed else 0  # the kill pin may have come in between
+        if not self.armed:  # the kill pin may have come in between, while a driver had not yet all its outputs
+            attached = 0
+            self._drivers.quiet()
+        self.attached = attached
         self._hold_unattached()
         self._board.unlock(state)
 
@@ -382,6 +385,7 @@ class Motor:
             self._quiet_ticks += 1
         if self._paused:
             self._missed += 1
+            _measure(self._times_us, self._period_us, begun_us, board.ticks_us())
             return
         while self._missed:
             self._missed -= 1
