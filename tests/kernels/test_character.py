@@ -156,6 +156,11 @@ def test_character_saturates_on_either_side():
         dof = Moved(2, 3, 4, formats.MOTOR_PERIOD_MIN_US, start)
         dof.tick(end)
         assert dof.rate == rate
+    # A sine in time with its swinging would come out with 1 / (2 * zeta) of its height and more.
+    for middle in (0.5, -0.5):
+        dof = Moved(1, 0.1, 4, 20_000, middle)
+        found = [dof.tick(middle + math.sin(2 * math.pi * tick / 50)) for tick in range(1000)]
+        assert (max(found) if middle > 0 else -min(found)) == 4
 
 
 @pytest.mark.parametrize(("f_hz", "zeta", "r"), CORNERS)

@@ -651,6 +651,31 @@ def test_chips_that_share_oe_are_let_out_together():
     assert [outputs.board.chips[0, address].counts(0) for address in (0x40, 0x41)] == [307, 307]
 
 
+def test_chip_that_is_killed_in_a_burst_and_lost_holds_those_off_that_share_its_oe():
+    second = (4, 5, 0x41, 6, 400, 25000)
+    outputs = Outputs((DRIVER_PCA9685, 0, 0), (DRIVER_PCA9685, 1, 0), devices=[CHIP, second])
+    outputs.settle()
+    chip = outputs.board.chips[0, 0x40]
+    outputs.attach(0)
+
+    def kill():
+        outputs.board.on_transfer = lambda: None
+        outputs.drivers.quiet()
+
+    outputs.board.on_transfer = kill
+    outputs.drivers.flush(outputs.level_q24, outputs.pulse_q18us, 1)
+    assert chip.counts(0) == 307, "it has the pulse that it must not let out"
+    chip.present = False
+    outputs.attach(1)
+    for _ in range(3):
+        outputs.attend(due=0b10)
+    assert outputs.board.output[6] == 1
+    chip.present = True
+    for _ in range(30):
+        outputs.attend(due=0b10, passed_us=20_000)
+    assert outputs.board.output[6] == 0 and chip.counts(0) == 0
+
+
 def test_channels_that_stay_go_on_without_a_break():
     outputs, chip = running_chip(3, 5)
     outputs.attach(0, 1)
