@@ -161,6 +161,15 @@ def test_kill_pin_acts_in_a_tick_when_nothing_plays():
     assert (motor.armed, motor.attached, drivers.pulsing, motor.killed_by) == (False, 0, 0, KILLED_BY_PIN)
 
 
+def test_silence_is_counted_in_ticks_when_nothing_plays():
+    motor, board, _ = armed_motor(2)
+    motor.heard()
+    board.run(motor, 500_000 // TICK_US)
+    assert not motor.silent
+    board.run(motor, 1)
+    assert motor.silent
+
+
 def test_ticks_that_stop_cost_the_pulses_and_leave_the_watchdog_hungry():
     motor, board, drivers = armed_motor(2)
     fed = board.fed
