@@ -212,6 +212,7 @@ class Motor:
         self._rearrange(before, tables, gather_words, gather_halves, scratch)
         self._take_over(tables)
         self._paused = False
+        self._board.kept_pose(0, self.position_q24, _tag(tables))  # from now on it is kept under the new tag
 
     def _rearrange(self, before, tables, gather_words, gather_halves, scratch):
         keep = tables.keep_dof
