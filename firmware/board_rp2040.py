@@ -90,6 +90,7 @@ def _drive(pin: int, level: int):
     else:
         sio[6] = bit  # GPIO_OUT_CLR
     sio[9] = bit  # GPIO_OE_SET
+    ptr32((_PADS + pin) << 2)[0] = 0x56  # as after a reset: it may have been an analogue input, which has no output
     ptr32((_CONTROLS + (pin << 1)) << 2)[0] = 5  # SIO
 
 
@@ -471,6 +472,8 @@ class Board:
         self._attach(pin, _BRIDGE_US, _DIVIDER_BRIDGE, _BRIDGE_COUNTS, 0)
 
     def _attach(self, pin, period_us, divider_q4, counts, at):
+        if not self._use[pin]:
+            _drive(pin, 0)
         number = (pin >> 1) & 7
         if self._slice_us[number] != period_us or not self._shared(pin):
             self._slice_us[number] = period_us
