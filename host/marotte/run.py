@@ -32,6 +32,8 @@ SILENT_S = 0.5
 """A view without a new frame for so long says so."""
 FAREWELL_S = 1.0
 WEIGHT_Q12_ONE = 1 << 12
+ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+"""Signals that end a run as Ctrl-C does; SIGHUP comes when its terminal is closed, or the connection to it is lost."""
 
 
 @dataclass
@@ -270,7 +272,7 @@ def _every(puppet: Puppet, rate_hz: int) -> int:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """Let SIGTERM end the block as Ctrl-C does."""
+    """Let ENDING signals end the block as Ctrl-C does, but for those that are ignored, as `nohup` does it."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -278,11 +280,13 @@ def _interruptible() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, interrupt)
+    numbers = [number for number in ENDING if signal.getsignal(number) is not signal.SIG_IGN]
+    before = [signal.signal(number, interrupt) for number in numbers]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -304,7 +308,7 @@ def _uninterruptible() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    signals = (signal.SIGINT, signal.SIGTERM)
+    signals = (signal.SIGINT, *ENDING)
     before = [signal.signal(number, signal.SIG_IGN) for number in signals]
     try:
         yield
