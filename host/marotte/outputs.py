@@ -13,6 +13,8 @@ from shared import formats
 RATE_RANGE_HZ = (50, 333)
 TRIM_MAX_US = 300
 DEAD_BAND_RANGE = (0, 0.5)
+DEAD_BAND_RISE = 64
+"""A wheel gets its dead band's share from 1/64 of full speed on, below in proportion."""
 TOP_SPEED_RANGE = (0.1, 1)
 RELEASE_RANGE_S = (0.1, 60)
 SHARE_RANGE = (0.05, 1)
@@ -81,9 +83,10 @@ class Output:
         return (high, low) if self.invert else (low, high)
 
     def drive_of(self, speed: float) -> float:
-        """Return the drive, -1..1, with which a wheel has a speed of -1..1: outside the dead band unless it stands."""
-        share = abs(speed) * (self.top_speed - self.dead_band) + self.dead_band
-        return 0.0 if speed == 0 else share if speed > 0 else -share
+        """Return the drive, -1..1, with which a wheel has a speed of -1..1; from 1/64 on it is outside the dead band."""
+        size = abs(speed)
+        drive = self.dead_band * min(DEAD_BAND_RISE * size, 1) + (self.top_speed - self.dead_band) * size
+        return drive if speed >= 0 else -drive
 
 
 def read_output(dof: str, table: Table, relative: bool | None, chips: Chips) -> Output | None:

@@ -13,6 +13,7 @@ from marotte.puppet_file import load_puppet
 from marotte.tomlfile import FileMistakes
 from marotte.wiring import Kill, Robot, load_robot, read_robot
 from shared import formats
+from tests.reference_motor import driven
 
 PUPPETS = Path(__file__).parents[2] / "puppets"
 
@@ -154,11 +155,18 @@ def test_output_ends_have_trim_and_inversion(output, ends_us):
 
 
 @pytest.mark.parametrize(
-    ("speed", "drive"), [(0, 0), (1, 0.9), (-1, -0.9), (1e-9, 0.2), (-1e-9, -0.2), (0.5, 0.55), (-0.5, -0.55)]
+    ("speed", "drive"),
+    [(0, 0), (1, 0.9), (-1, -0.9), (1 / 64, 0.2 + 0.7 / 64), (1 / 128, 0.1 + 0.7 / 128), (-0.5, -0.55)],
 )
 def test_output_drives_a_wheel_beyond_its_dead_band(speed, drive):
     output = Output("W", Bridge("two-pwm", (2, 3)), dead_band=0.2, top_speed=0.9)
     assert output.drive_of(speed) == pytest.approx(drive)
+
+
+@given(speed=st.floats(-1, 1), dead=st.floats(0, 0.5), more=st.floats(0.1, 0.5))
+def test_output_drives_a_wheel_as_the_motor_layer_does(speed, dead, more):
+    output = Output("W", Bridge("two-pwm", (2, 3)), dead_band=dead, top_speed=dead + more)
+    assert output.drive_of(speed) == pytest.approx(driven(speed, dead, dead + more))
 
 
 # rate of the robot, of each output; period of the ticks, turns of each output
