@@ -16,7 +16,7 @@ from marotte.drivers import Bridge
 from marotte.errors import MarotteError
 from marotte.functions import Function
 from marotte.limits import Limits, tightest, whole_range
-from marotte.outputs import DEAD_BAND_RANGE, TOP_SPEED_RANGE, TRIM_MAX_US, Output
+from marotte.outputs import DEAD_BAND_RANGE, TOP_SPEED_RANGE, TRIM_MAX_US, Output, is_beyond
 from marotte.puppet import ABSOLUTE, RELATIVE, Action, Dof, Live, MappingEntry, Puppet
 from marotte.session import Session
 from marotte.tables import build_tables, weight_q28
@@ -126,8 +126,17 @@ class Calibration:
         changed = replace(self.output, **changes)  # type: ignore[arg-type]
         for end_us in changed.ends_us:
             _check("a pulse with its trim", end_us, formats.PULSE_MIN_US, formats.PULSE_MAX_US)
-        if changed.dead_band >= changed.top_speed:
-            raise CalibrationError(f"found {changed.top_speed:g} as top speed, expected more than the dead band")
+        if not changed.has_span:
+            low_us, high_us = changed.pulse_us
+            raise CalibrationError(
+                f"found {low_us:g} and {high_us:g} us as the pulses' ends, "
+                f"expected two that are 1/{1 << formats.PULSE_BITS} us apart at least"
+            )
+        if not is_beyond(changed.top_speed, changed.dead_band):
+            raise CalibrationError(
+                f"found {changed.top_speed:g} as top speed, expected more than the dead band of {changed.dead_band:g}, "
+                f"by 1/{formats.VALUE_ONE} at least"
+            )
         self._session.calibrate(changed)
         self.output = changed
         return ", ".join(self.text().splitlines()[1:])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from marotte.drivers import DRIVES, Chips, Drive
+from marotte.fixed import fixed
 from marotte.limits import Limits, read_limits
 from marotte.pins import ADC_PINS
 from marotte.tomlfile import Table, found
@@ -32,7 +33,7 @@ class Duty:
     """How much of the time a DOF may move before it is let go to cool down."""
 
     share: float = 1.0
-    window_s: float = 60.0
+    window_s: int = 60
 
 
 @dataclass(frozen=True)
@@ -82,11 +83,22 @@ class Output:
         low, high = (end + self.trim_us for end in self.pulse_us)
         return (high, low) if self.invert else (low, high)
 
+    @property
+    def has_span(self) -> bool:
+        """Whether its pulses at both ends differ, as finely as they travel."""
+        low, high = (fixed(end_us, formats.PULSE_BITS) for end_us in self.ends_us)
+        return low != high
+
     def drive_of(self, speed: float) -> float:
         """Return the drive, -1..1, with which a wheel has a speed of -1..1; from 1/64 on it is outside the dead band."""
         size = abs(speed)
         drive = self.dead_band * min(DEAD_BAND_RISE * size, 1) + (self.top_speed - self.dead_band) * size
         return drive if speed >= 0 else -drive
+
+
+def is_beyond(top_speed: float, dead_band: float) -> bool:
+    """Return whether a top speed is above a dead band, as finely as they travel."""
+    return fixed(top_speed, formats.VALUE_BITS) > fixed(dead_band, formats.VALUE_BITS)
 
 
 def read_output(dof: str, table: Table, relative: bool | None, chips: Chips) -> Output | None:
@@ -145,6 +157,11 @@ def _check_ends(table: Table, output: Output) -> None:
             f"expected {formats.PULSE_MIN_US}..{formats.PULSE_MAX_US}",
             "trim_us",
         )
+    if not output.has_span:
+        table.mistake(
+            f"found {found(table.value('pulse_us'))}, expected two pulse widths, 1/{1 << formats.PULSE_BITS} us apart at least",
+            "pulse_us",
+        )
 
 
 def _wheel(table: Table, relative: bool | None) -> tuple[float, float]:
@@ -156,8 +173,12 @@ def _wheel(table: Table, relative: bool | None) -> tuple[float, float]:
         return Output.dead_band, Output.top_speed
     dead_band = table.number("dead_band", *DEAD_BAND_RANGE, default=Output.dead_band)
     top_speed = table.number("top_speed", *TOP_SPEED_RANGE, default=Output.top_speed)
-    if dead_band >= top_speed:
-        table.mistake(f"found {top_speed:g}, expected more than the dead band of {dead_band:g}", "top_speed")
+    if not is_beyond(top_speed, dead_band):
+        table.mistake(
+            f"found {found(table.value('top_speed', top_speed))}, expected more than the dead band of {dead_band:g}, "
+            f"by 1/{formats.VALUE_ONE} at least",
+            "top_speed",
+        )
     return dead_band, top_speed
 
 
@@ -167,7 +188,7 @@ def _duty(table: Table) -> Duty:
     inner = table.table("duty")
     inner.require("share", f"the share of the time in which it may move, {SHARE_RANGE[0]:g}..{SHARE_RANGE[1]:g}")
     share = inner.number("share", *SHARE_RANGE, default=Duty.share)
-    window_s = inner.number("window", *WINDOW_RANGE_S, default=Duty.window_s)
+    window_s = inner.integer("window", *WINDOW_RANGE_S, default=Duty.window_s)
     inner.finish()
     return Duty(share, window_s)
 

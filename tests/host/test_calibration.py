@@ -101,6 +101,16 @@ def test_calibration_of_a_wheel(robot, mcu):
     assert calibration.text() == "[output.WHEEL]\ndead_band = 0.2\ntop_speed = 0.9\ninvert = false"
 
 
+def test_calibration_of_a_wheel_keeps_its_top_speed_above_its_dead_band(robot, mcu):
+    with Calibration(opened(mcu), robot, robot.outputs["WHEEL"]) as calibration:
+        for line in ("top 0.1", "top 0.100001"):
+            with pytest.raises(
+                CalibrationError, match="as top speed, expected more than the dead band of 0.1, by 1/32768"
+            ):
+                calibration.do(line)
+        calibration.do("top 0.2")
+
+
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
@@ -111,6 +121,7 @@ def test_calibration_of_a_wheel(robot, mcu):
         ("dead 0.1", "found 'dead 0.1', expected"),
         ("0", "found 0 as the value, expected a number in 0.1..1"),
         ("low 299", "found 299 as a pulse, expected a number in 300..3000"),
+        ("low 2000.01", "found 2000.01 and 2000 us as the pulses' ends, expected two that are 1/16 us apart at least"),
         ("trim 301", "found 301 as the trim, expected a number in -300..300"),
     ],
 )

@@ -265,7 +265,7 @@ invert = true
 dead_band = 0.25
 top_speed = 0.75
 accel = 8
-duty = { share = 0.5, window = 30.4 }
+duty = { share = 0.5, window = 30 }
 """
 
 

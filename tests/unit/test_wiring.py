@@ -283,6 +283,11 @@ MISTAKES = [
     (A + 'pin=2\ndriver="pin"', ':3 output.A.driver: found "pin", expected "pins" or "pca9685" or "bridge"'),
     (A + "pin=2\npulse_us=[1000]", ":3 output.A.pulse_us: found 1 values, expected 2: the pulse widths"),
     (A + "pin=2\npulse_us=[200,2000]", ":3 output.A.pulse_us[0]: found 200, expected a number in 300..3000"),
+    (
+        A + "pin=2\npulse_us=[1500,1500]",
+        ":3 output.A.pulse_us: found [1500, 1500], expected two pulse widths, 1/16 us apart at least",
+    ),
+    (A + "pin=2\npulse_us=[1500.02,1500.01]", ":3 output.A.pulse_us: found [1500.02, 1500.01], expected two pulse"),
     (A + "pin=2\ntrim_us=301", ":3 output.A.trim_us: found 301, expected a number in -300..300"),
     (
         A + "pin=2\npulse_us=[400,2900]\ntrim_us=200",
@@ -302,11 +307,26 @@ MISTAKES = [
         A + "pin=2\ndead_band=0.4\ntop_speed=0.4",
         ":4 output.A.top_speed: found 0.4, expected more than the dead band of 0.4",
     ),
+    (
+        A + "pin=2\ndead_band=0.3\ntop_speed=0.300001",
+        ":4 output.A.top_speed: found 0.300001, expected more than the dead band of 0.3, by 1/32768 at least",
+    ),
+    (
+        A + "pin=2\ndead_band=0.3\ntop_speed=0.3000000001",
+        ":4 output.A.top_speed: found 0.3000000001, expected more than the dead band of 0.3, by 1/32768 at least",
+    ),
     (A + "pin=2\nrelease=0", ":3 output.A.release: found 0, expected a number in 0.1..60"),
     (A + "pin=2\nduty=0.5", ":3 output.A.duty: found 0.5, expected a table"),
     (A + "pin=2\nduty={}", ':3 output.A.duty: has no "share"; expected the share of the time'),
     (A + "pin=2\nduty={share=0}", ":3 output.A.duty.share: found 0, expected a number in 0.05..1"),
-    (A + "pin=2\nduty={share=0.5, window=601}", ":3 output.A.duty.window: found 601, expected a number in 1..600"),
+    (
+        A + "pin=2\nduty={share=0.5, window=601}",
+        ":3 output.A.duty.window: found 601, expected a whole number in 1..600",
+    ),
+    (
+        A + "pin=2\nduty={share=0.5, window=1.2}",
+        ":3 output.A.duty.window: found 1.2, expected a whole number in 1..600",
+    ),
     (A + "pin=2\nduty={share=0.5, windows=6}", ':3 output.A.duty.windows: unknown key; did you mean "window"?'),
     (
         A + "pin=2\nfeedback={at=[0,1]}",
