@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
+from marotte.drivers import Drive
 from marotte.errors import MarotteError
 from marotte.files import Files, Watch
 from marotte.link import Carrier, LinkRefused
@@ -181,6 +182,7 @@ class _Play:
         self._ask_for_telemetry(files.puppet)
         self._take_telemetry()
         before = self.files.puppet
+        arms = bool(_driven(files) - _driven(self.files))
         was = state(self._steps, before, self.scene.frame)
         self._take(files)
         now, *later = resumed(self._steps, files.puppet, self.scene.frame)
@@ -189,7 +191,8 @@ class _Play:
         tempos = {files.puppet.action_index(name): files.puppet.actions[name].tempo for name in cued}
         steps = [replace(now, tempos={**tempos, **now.tempos}), *later]
         self._prompter = Prompter(self.session, steps, self.session.welcome["queue_max"])
-        self._arm_again()  # for outputs that are new
+        if arms:  # only for outputs that are new, as it gives pulses to what has stalled
+            self._arm_again()
 
     def _arm_again(self) -> None:
         """Arm after an exchange; yet what somebody has killed stays so, whatever is saved in a file."""
@@ -263,6 +266,12 @@ class _Play:
             _, cue = self._cues.pop(0)
             self.scene.cue = cue.summary()
             self.view.cue(float(cue.at_s), self.scene.cue)
+
+
+def _driven(files: Files) -> set[tuple[str, str, Drive]]:
+    """Return which DOFs have outputs, of which kind they are, and what drives them."""
+    outputs = files.robot.outputs if files.robot else {}
+    return {(name, dof.kind, outputs[name].drive) for name, dof in files.puppet.dofs.items() if name in outputs}
 
 
 def _every(puppet: Puppet, rate_hz: int) -> int:
