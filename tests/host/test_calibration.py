@@ -105,7 +105,7 @@ def test_calibration_of_a_wheel_keeps_its_top_speed_above_its_dead_band(robot, m
     with Calibration(opened(mcu), robot, robot.outputs["WHEEL"]) as calibration:
         for line in ("top 0.1", "top 0.100001"):
             with pytest.raises(
-                CalibrationError, match="as top speed, expected more than the dead band of 0.1, by 1/32768"
+                CalibrationError, match=r"as top speed, expected more than the dead band of 0\.1, by 1/32768"
             ):
                 calibration.do(line)
         calibration.do("top 0.2")
