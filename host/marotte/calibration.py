@@ -19,6 +19,7 @@ from marotte.limits import Limits, tightest, whole_range
 from marotte.outputs import DEAD_BAND_RANGE, TOP_SPEED_RANGE, TRIM_MAX_US, Output, is_beyond
 from marotte.puppet import ABSOLUTE, RELATIVE, Action, Dof, Live, MappingEntry, Puppet
 from marotte.session import Session
+from marotte.signals import uninterruptible
 from marotte.tables import build_tables, weight_q28
 from marotte.wiring import Robot
 from shared import formats
@@ -58,15 +59,23 @@ class Calibration:
     def __enter__(self) -> Calibration:
         session = self._session
         session.upload(build_tables(_puppet(self.output.dof, self.relative), self._robot))
-        session.weight_targets(0, {0: weight_q28(1.0)})
-        session.arm()
-        session.wait_attached()
-        session.start()
-        session.flush()
+        try:
+            session.weight_targets(0, {0: weight_q28(1.0)})
+            session.arm()
+            session.wait_attached()
+            session.start()
+            session.flush()
+        except BaseException:
+            self._end()
+            raise
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        with contextlib.suppress(MarotteError):
+        self._end()
+
+    def _end(self) -> None:
+        """Kill the outputs and stop, not to be interrupted in it."""
+        with uninterruptible(), contextlib.suppress(MarotteError):
             self._session.kill()
             self._session.stop()
             self._session.flush()

@@ -26,6 +26,7 @@ from marotte.ports import SerialCarrier
 from marotte.pulses import PulseSummary, measure
 from marotte.puppet import Puppet
 from marotte.session import Session
+from marotte.signals import interruptible
 from marotte.tables import build_tables
 from marotte.view import View
 from marotte.wiring import Robot
@@ -184,7 +185,7 @@ def calibrate(robot: Robot, output: Output, relative: bool | None, where: Where,
 def _calibrate(session: Session, robot: Robot, output: Output, relative: bool | None, console: Console) -> None:
     session.open()
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
-    with Calibration(session, robot, output, relative) as calibration:
+    with interruptible(), Calibration(session, robot, output, relative) as calibration:
         _say(console, f"{output.dof} at {output.drive.place} has its pulses. Commands: {calibration.commands}")
         threading.Thread(target=_read_lines, args=(lines,), daemon=True).start()
         while True:

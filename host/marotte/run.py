@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -17,6 +15,7 @@ from marotte.prompter import Prompter
 from marotte.puppet import Puppet
 from marotte.score import Score, resumed, state
 from marotte.session import Session, killer
+from marotte.signals import interruptible, uninterruptible
 from marotte.tables import build_tables, value_of
 from marotte.tomlfile import FileMistakes
 from marotte.view import REFRESH_HZ, Scene, View
@@ -33,8 +32,6 @@ SILENT_S = 0.5
 """A view without a new frame for so long says so."""
 FAREWELL_S = 1.0
 WEIGHT_Q12_ONE = 1 << 12
-ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-"""Signals that end a run as Ctrl-C does; SIGHUP comes when its terminal is closed, or the connection to it is lost."""
 
 
 @dataclass
@@ -76,7 +73,7 @@ def perform(
     view.note(f"{puppet.name} uploaded in {(carrier.now_us() - begin_us) / 1000:.0f} ms, on {view.where}")
     play = _Play(Files(puppet, score, robot), session, view, arm, seconds)
     performance = Performance()
-    with _interruptible(), _safe_end(session, performance):
+    with interruptible(), _safe_end(session, performance):
         play.begin()
         try:
             while not play.is_done:
@@ -280,47 +277,14 @@ def _every(puppet: Puppet, rate_hz: int) -> int:
 
 
 @contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """Let ENDING signals end the block as Ctrl-C does, but for those that are ignored, as `nohup` does it."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    numbers = [number for number in ENDING if signal.getsignal(number) is not signal.SIG_IGN]
-    before = [signal.signal(number, interrupt) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
 def _safe_end(session: Session, performance: Performance) -> Iterator[None]:
     """Kill the outputs and stop the motion when the block ends, however it does, and not to be interrupted in it."""
     try:
         yield
     finally:
-        with _uninterruptible(), contextlib.suppress(MarotteError):
+        with uninterruptible(), contextlib.suppress(MarotteError):
             session.kill()
             session.flush(FAREWELL_S)
             performance.status = session.status()
             session.stop()
             session.flush(FAREWELL_S)
-
-
-@contextlib.contextmanager
-def _uninterruptible() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signals = (signal.SIGINT, *ENDING)
-    before = [signal.signal(number, signal.SIG_IGN) for number in signals]
-    try:
-        yield
-    finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)

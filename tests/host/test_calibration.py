@@ -1,6 +1,12 @@
 """Calibrating by hand: one output alone has pulses, it goes slowly where it is told, and its ends move while it does."""
 
 import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
 from itertools import pairwise
 
 import pytest
@@ -8,7 +14,8 @@ import pytest
 import marotte
 from marotte import cli
 from marotte.calibration import Calibration, CalibrationError
-from marotte.link import VirtualCarrier
+from marotte.link import LinkSilent, VirtualCarrier
+from marotte.mcu.serve import serve
 from marotte.mcu.unix import UnixMcu
 from marotte.pulses import pulses
 
@@ -132,6 +139,63 @@ def test_calibration_refuses_what_it_does_not_understand(robot, mcu, line, expec
             calibration.do(line)
         assert str(error.value).startswith(expected)
         assert calibration.do("") == before
+
+
+def is_off(mcu):
+    mcu.clear_edges()
+    mcu.run_for(500_000)
+    return mcu.edges(2) == []
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, LinkSilent, RuntimeError])
+def test_calibration_that_cannot_begin_kills_the_output(robot, mcu, monkeypatch, error):
+    session = opened(mcu)
+
+    def fail():
+        session.pump(200_000)
+        assert widths_us(mcu, 2)
+        raise error
+
+    monkeypatch.setattr(session, "wait_attached", fail)
+    with pytest.raises(error), Calibration(session, robot, robot.outputs["NECK"]):
+        pytest.fail("began")
+    assert is_off(mcu)
+
+
+@contextmanager
+def calibrating(tmp_path, mcu, *wrapper):
+    """Yield a process that calibrates NECK of an MCU in real time; afterwards the MCU may be looked at."""
+    path = tmp_path / "robot.toml"
+    path.write_text(ROBOT)
+    with serve(mcu, tcp=0) as live:
+        command = [*wrapper, sys.executable, "-u", "-m", "marotte", "calibrate", str(path), "NECK", "--port", live.url]
+        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        with subprocess.Popen(command, **pipes, text=True) as process:
+            try:
+                assert process.stdout.readline().startswith("NECK at GP2 has its pulses")
+                time.sleep(0.2)  # for some of them
+                yield process
+            finally:
+                process.kill()
+        live.stop()
+        assert widths_us(mcu, 2)
+        assert is_off(mcu)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_calibrate_command_ends_with_its_output_off(tmp_path, mcu, number):
+    with calibrating(tmp_path, mcu) as process:
+        os.kill(process.pid, number)
+        assert process.wait(10) == 130
+        assert process.stderr.read() == ""
+
+
+def test_calibrate_command_respects_that_a_signal_is_ignored(tmp_path, mcu):
+    with calibrating(tmp_path, mcu, "nohup") as process:
+        os.kill(process.pid, signal.SIGHUP)
+        print("0.5", "done", sep="\n", file=process.stdin, flush=True)
+        assert process.wait(10) == 0
+        assert process.stdout.readline() == "NECK goes to 0.5\n"
 
 
 def test_calibrate_command_reads_standard_input(tmp_path, monkeypatch, capsys):
