@@ -13,15 +13,22 @@ ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(sig
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Let ENDING signals end the block as Ctrl-C does, but for those that are ignored, as `nohup` does it."""
+    """Let ENDING signals end the block as Ctrl-C does, but for those that are ignored, as `nohup` does it.
+
+    The first of them ends it, Ctrl-C included; those that follow are ignored, so that they do not disturb its clean-up.
+    """
 
     def interrupt(*_: object) -> None:
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     numbers = [number for number in ENDING if signal.getsignal(number) is not signal.SIG_IGN]
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        numbers.append(signal.SIGINT)
     before = [signal.signal(number, interrupt) for number in numbers]
     try:
         yield
