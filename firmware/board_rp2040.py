@@ -288,6 +288,11 @@ class Board:
         self._usb_room.register(sys.stdout, select.POLLOUT)
         self._poll = select.poll()
         self._poll.register(sys.stdin, select.POLLIN)
+        for poll in (self._usb_poll, self._usb_room, self._poll):  # the first event allocates what tells of all
+            poll.register(self._uart, select.POLLOUT)
+            for _ in poll.ipoll(0):
+                pass
+            poll.unregister(self._uart)
         self._poll.register(self._uart, select.POLLIN)
         self._byte = bytearray(1)
         self._timer = machine.Timer(-1)
@@ -466,6 +471,10 @@ class Board:
         counts = period_us * 25 >> 3
         at = counts - (until_wrap_us % period_us * 25 >> 3)
         self._attach(pin, period_us, _DIVIDER_SERVO, counts, at if at < counts else 0)
+
+    def servo_end(self, pin):
+        """Give a pin no more pulses, from its next period on."""
+        _clear(pin)
 
     def bridge_attach(self, pin):
         """Give a pin to its PWM slice at 20 kHz, low."""

@@ -100,6 +100,10 @@ class Board(VirtualTime):
                 pack_into("<I", out, at + 1, pulse_q18us[d])
                 at += 5
 
+    def servo_end(self, pin):
+        """Give a pin no more pulses, from its next period on."""
+        self._out[self._record(b"E", 1)] = pin
+
     def bridge_attach(self, pin):
         """Give a pin to its PWM slice at 20 kHz, low."""
         self.servo_attach(pin, _BRIDGE_US, _BRIDGE_US)

@@ -25,6 +25,21 @@ from shared.formats import (
 )
 
 _PAYLOAD = const(2)  # place of the payload in a body
+_LEAN = (
+    messages.HELLO,
+    messages.PING,
+    messages.WEIGHT_TARGETS,
+    messages.LIVE_TARGETS,
+    messages.TEMPO,
+    messages.ARM,
+    messages.KILL,
+    messages.TELEMETRY,
+    messages.STATUS_REQUEST,
+    messages.CALIBRATE,
+    messages.LIMIT,
+)
+"""What is carried out without allocating."""
+
 _LARGE = const(0x3FFFFFFF)  # more than any field may have, and no large integer
 
 _HELLO_FORMAT = messages.struct_format(messages.find(messages.HELLO)[2])
@@ -48,8 +63,8 @@ def _word(body, at):
 class Commands:
     """Carries out the commands for one puppet.
 
-    `detail` explains the last status. `dictionary` is the checksum of the message dictionary. `store` keeps what is to be
-    kept on the flash.
+    `detail` explains the last status. `allocates` tells which ids need the heap. `dictionary` is the checksum of the
+    message dictionary. `store` keeps what is to be kept on the flash.
     """
 
     def __init__(self, puppet, telemetry, store):
@@ -65,8 +80,10 @@ class Commands:
         self._item = bytearray(128)
         self._formats = [None] * 128
         self._handlers = [None] * 128
+        self.allocates = bytearray(128)
         for name, message_id, fields, items in messages.MESSAGES:
             if message_id < 128:
+                self.allocates[message_id] = message_id not in _LEAN
                 self._fixed[message_id] = messages.size(fields)
                 self._item[message_id] = messages.size(items)
                 self._formats[message_id] = messages.struct_format(fields)

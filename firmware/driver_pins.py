@@ -1,7 +1,7 @@
 """Servos on the board's own PWM pins.
 
 Setting: the pin. The period is that of the DOF's turn among the motor ticks (`turns * motor_period_us`), and each period
-begins 1 ms after such a tick: the tick has written the new pulse width by then, and the hardware takes it over as the period
+begins 2.2 ms after such a tick: the tick has written the new pulse width by then, and the hardware takes it over as the period
 begins. So no pulse is ever cut or doubled, and all pulses are one constant time behind their tick.
 """
 
@@ -11,7 +11,7 @@ from firmware.driver import Driver
 from firmware.tables import halves
 from shared.formats import DOFS_MAX, DRIVER_PINS, NO_PIN, SETTINGS_MAX
 
-_AFTER_TICK_US = const(1000)
+_AFTER_TICK_US = const(2200)  # a tick takes up to 1.6 ms, and one of 333 Hz ends after 3
 
 
 class PinsDriver(Driver):
@@ -56,17 +56,17 @@ class PinsDriver(Driver):
         return kept
 
     def attach(self, dof, until_us):
-        """Give the DOF's pin to its PWM slice, which begins a period 1 ms after the DOF's next turn."""
+        """Give the DOF's pin to its PWM slice, which begins a period 2.2 ms after the DOF's next turn."""
         if self._attached >> dof & 1:
             return
         self._board.servo_attach(self._pin[dof], self._period_us[dof], until_us + _AFTER_TICK_US)
         self._attached |= 1 << dof
 
     def release(self, dof):
-        """Drive the DOF's pin low."""
+        """Let the DOF's pin have no pulse any more; one that is under way is given whole."""
         if self._attached >> dof & 1:
             self._attached &= ~(1 << dof)
-            self._board.pin_low(self._pin[dof])
+            self._board.servo_end(self._pin[dof])
 
     def write(self, level_q24, pulse_q18us, due):
         """Set the pulse widths of the attached DOFs in `due`."""

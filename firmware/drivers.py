@@ -36,6 +36,13 @@ class Drivers:
             return 0
         return self._drivers[code].check_device(settings, count)
 
+    def device_uses(self, code, settings, pin):
+        """Return the number of the setting of a device that is this pin, or None."""
+        for number in self._drivers[code].device_pins:
+            if settings[number] == pin:
+                return number
+        return None
+
     def check_output(self, code, tables, dof, settings, count):
         """Return None if `count` settings suit an output of a DOF, else the number of the bad one.
 

@@ -2,7 +2,7 @@
 
 The host says for every new action, DOF and live channel which old one it was; what keeps its name keeps its state. What
 takes long is prepared a step at a time between frames, so that none is late: noise tables, repeated functions, the
-streams of blinks. Then, at the beginning of a frame, every state array is gathered by the list of old places.
+streams of blinks. Then, behind a frame, every state array is gathered by the list of old places.
 """
 
 import micropython
@@ -106,7 +106,7 @@ class Exchange:
         puppet.motor.load(puppet.tables)
 
     def carry_over(self):
-        """Put the prepared tables into force at the beginning of a frame; what keeps its name goes on."""
+        """Put the prepared tables into force between two frames; what keeps its name goes on."""
         puppet = self._puppet
         old = puppet.tables
         new = puppet.staged

@@ -32,6 +32,7 @@ def limit(
     high_q24: ptr32,
     speed_q24: ptr32,
     accel_q24: ptr32,
+    force_q24: ptr32,
     standing: int,
     calm_q24: int,
 ):
@@ -39,8 +40,9 @@ def limit(
 
     `wanted`, `correction`, `reference` and `velocity` (per tick) are Q24 with 16 added. `reference` is what was wanted in the
     last tick, within the range; this one's is written there. A DOF that is `held` stands still. `standing` not 0 lets
-    relative DOFs come to a stand, by at most `calm_q24` a tick. Limits: `low <= high` within 0..2^24, speed 1..2^24, accel
-    2..2^24.
+    relative DOFs come to a stand, by at most `calm_q24` a tick. `force` is the acceleration in force: where `accel` has
+    become smaller, a DOF brakes with the old one until it could stop in time with the new one. Limits: `low <= high` within
+    0..2^24, speed 1..2^24, accel 2..2^24.
     Bits: positions have 25, distances 26, `2 x / A` 26; `n (n + 1)` stays below 2^27, `A (n - 1)` below 2^26.
     """
     d = 0
@@ -67,6 +69,9 @@ def limit(
                 v = -accel
         elif held[d] == 0:
             speed = speed_q24[d]
+            force = force_q24[d]
+            if force < accel:
+                force = accel
             before = velocity_q24[d] - _ZERO
             last = reference_q24[d] - _ZERO
             moves = target - last
@@ -91,27 +96,37 @@ def limit(
                         v = speed
                     if v < -speed:
                         v = -speed
-                    if v > before + accel:
-                        v = before + accel
-                    if v < before - accel:
-                        v = before - accel
+                    if v > before + force:
+                        v = before + force
+                    if v < before - force:
+                        v = before - force
                     # Now the way to that end of the range which is ahead.
                     way = high - p if v >= 0 else p - low
                     if way < 0:
                         way = 0
                     if v <= accel and v >= -accel and v <= way and v >= -way:
+                        force = accel
                         turn = 2
                 elif v >= 0:
                     if v > x:
                         v = x
-                        if v < before - accel:
-                            v = before - accel
+                    if v < before - force:
+                        v = before - force
+                    else:
+                        force = accel
                 else:
                     if v < -x:
                         v = 0 - x
-                        if v > before + accel:
-                            v = before + accel
+                    if v > before + force:
+                        v = before + force
+                    else:
+                        force = accel
                 turn += 1
+            force_q24[d] = force
+            if p + v > 0x1000000:
+                v = 0x1000000 - p
+            if p + v < 0:
+                v = 0 - p
         position_q24[d] = p + v
         velocity_q24[d] = v + _ZERO
         reference_q24[d] = target + _ZERO

@@ -22,7 +22,7 @@ from firmware.commands import Commands
 from firmware.store import Store
 from firmware.telemetry import Telemetry
 from shared import codec, messages
-from shared.formats import ACTIONS_MAX, DOFS_MAX, LIVES_MAX, MAPPINGS_MAX, QUEUE_MAX
+from shared.formats import ACTIONS_MAX, DOFS_MAX, KILLED_BY_HOST, LIVES_MAX, MAPPINGS_MAX, QUEUE_MAX
 
 _CHUNK = const(32)  # bytes taken between two looks at the frame clock; one costs up to 50 us on USB
 _STALE_US = const(20000)  # a partial packet older than this is dropped
@@ -74,6 +74,7 @@ class Link:
         self._out_wire = bytearray(codec.WIRE_MAX)
         self._out_seq = 0
         self._expected = -1  # no session yet
+        self._kills = False  # whether a kill has been carried out before its turn
         self._statuses = bytearray(_HISTORY)
         self._details = [0] * _HISTORY
         self._byte_us = board.ticks_us()
@@ -138,13 +139,26 @@ class Link:
         self._puppet.motor.heard()
         message_id = body[0]
         seq = body[1]
+        if message_id == messages.KILL:  # now, whatever is missing before it; in its turn it is carried out again
+            self._puppet.motor.kill(KILLED_BY_HOST)
+            self._kills = 0 < (seq - self._expected) & 255 < 128
         if message_id == messages.HELLO:
             self._expected = seq
+            self._kills = False
         elif self._expected < 0:
             return  # no session: the host has to say hello
         ahead = (seq - self._expected) & 255
         if ahead == 0:
-            status = self.commands.carry_out(message_id, body, length - codec.OVERHEAD)
+            if self.commands.allocates[message_id]:  # the main loop keeps the heap locked
+                micropython.heap_unlock()
+                try:
+                    status = self.commands.carry_out(message_id, body, length - codec.OVERHEAD)
+                finally:
+                    micropython.heap_lock()
+            elif message_id == messages.ARM and self._kills:  # a kill that came after it has overtaken it
+                status = messages.STATE
+            else:
+                status = self.commands.carry_out(message_id, body, length - codec.OVERHEAD)
             detail = self.commands.detail
             self._statuses[seq % _HISTORY] = status
             self._details[seq % _HISTORY] = detail

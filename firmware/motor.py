@@ -80,14 +80,15 @@ class Motor:
     `tick` is the handler of the board's motor ticks. Per DOF: `position_q24` is where the layer has led it, `velocity_q24`
     what it moved in the last tick, `reference_q24` where it would like to be (both with `ZERO_Q24` added). `attached` has
     the bit of every DOF that has pulses. `tap_ring` holds the course at the instants of the last 16 frames, `tapped[0]` is
-    the last of them. `silent` tells that no packet has come for the puppet's `link_timeout`.
+    the last of them. `silent` tells that no packet has come for the puppet's `link_timeout`, once
+    there has been one.
     """
 
     def __init__(self, board, drivers, tables):
         self.armed = False
         self.attached = 0
         self.killed_by = KILLED_BY_NOBODY
-        self.silent = True
+        self.silent = False
         self.playing = False
         self.ticks = 0
         self.tables = tables
@@ -107,6 +108,7 @@ class Motor:
         self._character = Character()
         self._correction_q24 = words(DOFS_MAX)
         self._before_q24 = words(2 * DOFS_MAX)
+        self._force_q24 = words(DOFS_MAX)
         self._level_q24 = words(DOFS_MAX)
         self._pulse_q18us = words(DOFS_MAX)
         self._end_q4us = halves(2 * DOFS_MAX)
@@ -117,10 +119,14 @@ class Motor:
         self._part = 0  # of a frame in a tick, in millionths
         self._paused = False
         self._missed = 0
+        self._kill_pin = NO_PIN
+        self._kill_level = 0
+        self._maintained = 0
         self._calm_q24 = 0
         self._glide_q4us = 0
         self._timeout_ticks = 1
         self._quiet_ticks = 0
+        self._heard = False
         self._keep_ticks = 0
         self._keep_wait = 0
         self._starting = 0
@@ -180,6 +186,7 @@ class Motor:
                 self.position_q24[d] = tables.rest_q15[d] << 9
             elif tables.relative[d]:
                 self.position_q24[d] = _STILL_Q24
+            self.position_q24[d] = min(max(self.position_q24[d], tables.limit_low_q24[d]), tables.limit_high_q24[d])
             self._turn[d] = 0
             self._correction_q24[d] = ZERO_Q24
             self._take_ends(d)
@@ -224,6 +231,7 @@ class Motor:
             (self.velocity_q24, ZERO_Q24),
             (self.reference_q24, ZERO_Q24),
             (self._correction_q24, ZERO_Q24),
+            (self._force_q24, 0),
         ):
             gather_words(values, keep, scratch, dofs, fresh, 0)
         for place in range(2):
@@ -236,7 +244,8 @@ class Motor:
             self._turn[d] = ((self.ticks - self._since) & _COUNT_MASK) % tables.turns[d]
             was = keep[d]
             if was >= before.dofs:
-                self.position_q24[d] = tables.rest_q15[d] << 9
+                rest_q24 = tables.rest_q15[d] << 9
+                self.position_q24[d] = min(max(rest_q24, tables.limit_low_q24[d]), tables.limit_high_q24[d])
                 self._stand(d)
                 self.trajectory.stand_one(d, self.position_q24[d])
             if was >= before.dofs or not _same_output(tables, d, before, was):
@@ -279,17 +288,19 @@ class Motor:
     def heard(self):
         """Note that a packet has come."""
         self._quiet_ticks = 0
+        self._heard = True
         self.silent = False
 
     def arm(self):
         """Let pulses flow, one DOF after the other. Returns whether there is an output, and no pin that kills."""
         tables = self.tables
-        if tables.kill_pin != NO_PIN and self._board.level(tables.kill_pin) == tables.kill_level:
+        if self._kill_pin != NO_PIN and self._board.level(self._kill_pin) == self._kill_level:
+            self.killed_by = KILLED_BY_PIN
             return False
         for d in range(tables.dofs):
             if tables.driver[d] != NO_DRIVER:
-                self.armed = True
                 self.killed_by = KILLED_BY_NOBODY
+                self.armed = True
                 return self.guards.arm(self._board.ticks_us())
         return False
 
@@ -353,7 +364,7 @@ class Motor:
         self._board.unlock(state)
 
     def attend(self):
-        """Do what the main loop has to do for the motors: slow drivers, guards, the watchdog. Called at each pass."""
+        """Do what the main loop has to do for the motors at each pass: slow drivers, guards, the watchdog. Allocates nothing."""
         board = self._board
         now_us = board.ticks_us()
         if self.ticks == self._seen:
@@ -368,8 +379,13 @@ class Motor:
         self._later = 0
         board.unlock(state)
         self._drivers.flush(self._level_q24, self._pulse_q18us, due)
-        self._drivers.attend(now_us)
         self.guards.attend(now_us, self.silent and self.tables.when_silent == SILENT_RELAX)
+
+    def maintain(self):
+        """Let drivers set up their devices and find those that have come back, once a tick. May allocate."""
+        if self.ticks != self._maintained:
+            self._maintained = self.ticks
+            self._drivers.attend(self._board.ticks_us())
 
     # --- the tick
 
@@ -378,17 +394,17 @@ class Motor:
         begun_us = board.ticks_us()
         tables = self.tables
         self.ticks = (self.ticks + 1) & _COUNT_MASK
-        if tables.kill_pin != NO_PIN and self.armed and board.level(tables.kill_pin) == tables.kill_level:
+        if self.armed and self._kill_pin != NO_PIN and board.level(self._kill_pin) == self._kill_level:
             self.kill(KILLED_BY_PIN)
         if self._quiet_ticks >= self._timeout_ticks:
-            self.silent = True
+            self.silent = self._heard
         else:
             self._quiet_ticks += 1
         if self._paused:
             self._missed += 1
             _measure(self._times_us, self._period_us, begun_us, board.ticks_us())
             return
-        while self._missed:
+        if self._missed:  # one at a time: a UART has no room for more than 3 ms without attention
             self._missed -= 1
             next(self._course)
         next(self._course)
@@ -406,8 +422,8 @@ class Motor:
         are some sixty.
         """
         dofs, relative, turns = tables.dofs, tables.relative, tables.turns
-        low_q24, high_q24, speed_q24, accel_q24 = (
-            tables.limit_low_q24, tables.limit_high_q24, tables.speed_q24, tables.accel_q24
+        low_q24, high_q24, speed_q24, accel_q24, force_q24 = (
+            tables.limit_low_q24, tables.limit_high_q24, tables.speed_q24, tables.accel_q24, self._force_q24
         )
         end0_q4us, end1_q4us, dead_q15, top_q15 = (
             tables.end0_q4us, tables.end1_q4us, tables.dead_q15, tables.top_q15
@@ -437,7 +453,7 @@ class Motor:
             correct(attached, position_q24, correction_q24)
             limit(
                 wanted_q24, correction_q24, reference_q24, position_q24, velocity_q24, dofs, held, relative, low_q24,
-                high_q24, speed_q24, accel_q24, silent or not playing, calm_q24,
+                high_q24, speed_q24, accel_q24, force_q24, silent or not playing or not self._heard, calm_q24,
             )
             if playing:
                 self._tap(dofs)
@@ -496,8 +512,12 @@ class Motor:
         self._character.load(tables)
         self.feedback.load(tables)
         self.guards.load()
-        if tables.kill_pin != NO_PIN:
-            self._board.input_pullup(tables.kill_pin)
+        if tables.kill_pin != self._kill_pin:
+            self._kill_pin = NO_PIN
+            if tables.kill_pin != NO_PIN:
+                self._board.input_pullup(tables.kill_pin)
+        self._kill_level = tables.kill_level
+        self._kill_pin = tables.kill_pin
         self._timeout_ticks = tables.link_timeout_ms * 1000 // tables.motor_period_us
         course = self._steps(tables)
         next(course)

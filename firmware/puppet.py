@@ -29,6 +29,7 @@ from shared.formats import (
 )
 
 _COLLECT_US = const(12000)  # what the heap's collection takes on an RP2040
+_CARRY_US = const(16000)  # what putting other tables into force takes
 
 
 class Puppet:
@@ -78,7 +79,7 @@ class Puppet:
         self.hold_state = (self._hold_target_q28, self._hold_x_q28, self._hold_w_q28)
         self.exchange = Exchange(self)
         self._exchange_due = False
-        self._prepared_in = -1
+        self._waits_in = -1
         self._tempos_changed = 0
 
     def commit(self):
@@ -109,30 +110,37 @@ class Puppet:
             self.commit()
 
     def prepare(self):
-        """Take a step of what an exchange of tables needs before the next frame; return whether there was one to take.
+        """Take a step of what an exchange of tables needs between frames; return whether there was one to take.
 
-        The last one collects what tables leave on the heap, so that it does not fill up in the middle of a frame. It waits
-        until there is time for that, but no longer than for the end of the next frame.
+        The last two collect what tables leave on the heap, so that it does not fill up in the middle of a frame, and put the new
+        tables into force. They wait until there is time for that, but no longer than for the end of the next frame.
         """
-        if self.exchange.step < 0 or self._exchange_due:
+        if self.exchange.step < 0:
             return False
-        if not self.exchange.prepare():
-            self._prepared_in = self.frame
-        elif self.frame == self._prepared_in and self.clock.until_us(self._board.ticks_us()) < _COLLECT_US:
-            return False
-        else:
+        if self._exchange_due:
+            if self._has_time(_CARRY_US):
+                self._exchange_due = False
+                self.exchange.carry_over()
+                self._tempos_changed = 1
+                return True
+        elif not self.exchange.prepare():
+            self._waits_in = self.frame
+            return True
+        elif self._has_time(_COLLECT_US):
             gc.collect()
             self._exchange_due = True
-        return True
+            self._waits_in = self.frame
+            return True
+        return False
+
+    def _has_time(self, need_us):
+        """Return whether so much time is left until the next frame, or as much as there will ever be."""
+        return self.frame != self._waits_in or self.clock.until_us(self._board.ticks_us()) >= need_us
 
     def step(self):
         """Compute the frame that is due and hand it to the motors."""
         begun_us = self._board.ticks_us()
         self.clock.begin(begun_us)
-        if self._exchange_due:
-            self._exchange_due = False
-            self.exchange.carry_over()
-            self._tempos_changed = 1
         self._synthesise()
         self.base_ring.put(self.frame, self.tables.dofs, self.base_q15)
         self.motor.put(self.frame, self.signal_q15)

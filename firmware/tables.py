@@ -289,6 +289,8 @@ class Tables:
             return 2 + DEVICE_SETTINGS_MAX
         if self._drivers is not None:
             bad = self._drivers.check_device(driver, settings, count)
+            if bad is None and self.kill_pin != NO_PIN:
+                bad = self._drivers.device_uses(driver, settings, self.kill_pin)
             if bad is not None:
                 return 2 + bad
         self.device_driver[device] = driver

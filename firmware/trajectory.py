@@ -20,7 +20,7 @@ import micropython
 from micropython import const
 
 from firmware.tables import halves, words
-from shared.formats import DOFS_MAX, FRAMES_KEPT, NEW
+from shared.formats import DOFS_MAX, FRAMES_KEPT, NEW, POSITION_ONE
 
 ZERO_Q24 = 1 << 28
 KNOTS = 4  # recent targets per DOF, the newest first
@@ -31,6 +31,7 @@ _ONE = const(0x1000000)
 _MICRO = const(1000000)
 _FADE_MS = const(300)  # of the velocity while frames are late
 _GLIDE_MS = const(250)  # of the difference to a new source
+_GLIDE_PER_S = const(4)  # ranges a second with which that may begin
 _SETTLED = const(64)  # a difference below 2^-18 and as slow is gone
 
 
@@ -57,12 +58,14 @@ def _next_knots(
     fade_q15: int,
     keep_q15: int,
     share_q15: int,
+    most_q24: int,
 ):
     """Shift the knots of every DOF by one frame and append the newest.
 
     `knot` holds 4 x 16 words, the newest first; `glide` 2 x 16, the difference to the source and its velocity per
     frame. The target is `target_q15[at + dof]`, that of the frame before `before_q15[before_at + dof]`; `late` not 0
-    means that there is none. `share` is the frame's length by 0.25 s, `keep` is `exp(-share)`.
+    means that there is none. `share` is the frame's length by 0.25 s, `keep` is `exp(-share)`. A glide begins with the
+    difference of the velocities, `most` at most: one target alone may jump.
     Bits: differences stay within 2^25, products are taken in limbs of 13 + 12 and 15 bits, below 2^29.
     """
     d = 0
@@ -85,7 +88,12 @@ def _next_knots(
                 if value > _ONE:
                     value = _ONE
                 glide[d] = value - target + _ZERO
-                glide[_DOFS + d] = run - (target - (int(before_q15[before_at + d]) << 9)) + _ZERO
+                rate = run - (target - (int(before_q15[before_at + d]) << 9))
+                if rate > most_q24:
+                    rate = most_q24
+                if rate < -most_q24:
+                    rate = 0 - most_q24
+                glide[_DOFS + d] = rate + _ZERO
             else:
                 off = glide[d] - _ZERO
                 rate = glide[_DOFS + d] - _ZERO
@@ -211,7 +219,7 @@ class Trajectory:
         self._step = 0  # millionths of a frame in a tick
         self._delay = 0
         self._source = -1
-        self._fade_q15 = self._keep_q15 = self._share_q15 = 0
+        self._fade_q15 = self._keep_q15 = self._share_q15 = self._most_q24 = 0
 
     def load(self, tables):
         """Take over frame rate and motor rate; allocates."""
@@ -220,6 +228,7 @@ class Trajectory:
         self._delay = min(10000 * rate_hz, _MICRO // 2)
         self._fade_q15 = exp_q15(1000, _FADE_MS * rate_hz)
         self._keep_q15 = exp_q15(1000, _GLIDE_MS * rate_hz)
+        self._most_q24 = _GLIDE_PER_S * POSITION_ONE // rate_hz
         self._share_q15 = (1000 * 32768 + _GLIDE_MS * rate_hz // 2) // (_GLIDE_MS * rate_hz)
 
     def hold(self, dofs, position_q24):
@@ -305,6 +314,6 @@ class Trajectory:
         # fmt: off
         _next_knots(
             self._knot, self._glide, self._changed, dofs, target_q15, at, target_q15, before, late,
-            self._fade_q15, self._keep_q15, self._share_q15,
+            self._fade_q15, self._keep_q15, self._share_q15, self._most_q24,
         )
         # fmt: on

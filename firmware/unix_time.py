@@ -19,6 +19,7 @@ Records (file 2): kind u8, offset_us u32, count u16, bytes:
 
     S  bytes sent
     A  a pin is given to its PWM slice: pin u8, period_us u32, until_wrap_us u32
+    E  a pin gets no more pulses: pin u8
     P  on-times of PWM, from the next period on: pin u8, pulse_q18us u32, repeated
     L  a pin is driven, PWM or not: pin u8, level u8
     Z  a pin is let go of: pin u8

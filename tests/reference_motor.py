@@ -23,6 +23,9 @@ GUESS_TAU_S = 0.3
 """With this time constant a guessed motion comes to rest."""
 
 OFFSET_TAU_S = 0.25
+OFFSET_RATE_MAX = 4.0
+"""Ranges a second with which an offset may begin to move: a target alone may jump."""
+
 """With this time constant, critically damped, what a change of source has left over dies out."""
 
 _US = 1_000_000
@@ -87,7 +90,8 @@ class Knots:
         step = self._next_step()
         self._append(self.values[-1] + step)
         self.offset = self.values[-1] - target
-        self.offset_rate = (step - (0.0 if earlier is None else target - earlier)) / self._frame_s
+        rate = (step - (0.0 if earlier is None else target - earlier)) / self._frame_s
+        self.offset_rate = min(max(rate, -OFFSET_RATE_MAX), OFFSET_RATE_MAX)
         self._follows = True
 
     def leave(self):

@@ -21,14 +21,17 @@ from marotte.errors import MarotteError
 from marotte.mcu.base import VirtualMcu
 from shared import codec, messages
 
-WINDOW = 8
-URGENT_WINDOW = 12
+WINDOW = 4
+URGENT_WINDOW = 8
 """The same for urgent ones; the MCU remembers its last 16 answers."""
 
-WINDOW_BYTES = 300
-"""The MCU takes some 40 us for a byte. With no more on the way, a command that may not wait is carried out in time, and
-none is repeated only because those before it are still being read.
+WINDOW_BYTES = 128
+"""The MCU takes some 50 us for a byte, a UART at 115200 baud 87, and up to 2 ms to carry a command out. With no more on
+the way, a `kill` that overtakes what waits acts within 20 ms.
 """
+
+PAYLOAD_SENT_MAX = 80
+"""Longest payload that is sent, so that a packet alone does not take longer than that."""
 
 RETRY_US = 100_000
 HURRY_US = 5_000

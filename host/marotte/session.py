@@ -126,7 +126,7 @@ class Session:
         self._tables = tables
 
     def exchange(self, tables: Tables, playing: Puppet) -> None:
-        """Replace the tables of a puppet that moves, at the beginning of a frame.
+        """Replace the tables of a puppet that moves, between two frames.
 
         `playing` is the puppet whose tables the MCU has; actions, DOFs and live channels that keep their names keep weights,
         phases, poses and values. The frame rate has to be the same. Raises LinkRefused if the MCU refuses a part; the old tables

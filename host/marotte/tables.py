@@ -19,11 +19,12 @@ from typing import TypeAlias
 from marotte.character import response
 from marotte.fixed import fixed
 from marotte.limits import LimitsInUse
+from marotte.link import PAYLOAD_SENT_MAX
 from marotte.outputs import Feedback, Output
 from marotte.pools import Pools
 from marotte.puppet import Action, Dof, MappingEntry, Puppet
 from marotte.wiring import Robot
-from shared import codec, formats, messages
+from shared import formats, messages
 
 Message: TypeAlias = tuple[str, dict[str, int], list[dict[str, int]]]
 """Name, fields, and items: see `shared/messages.py`."""
@@ -31,7 +32,7 @@ Message: TypeAlias = tuple[str, dict[str, int], list[dict[str, int]]]
 HOLD_TAU_S = 0.25
 """How HOLD, which takes over what no action moves, comes and goes."""
 
-UPLOAD_ITEMS_MAX = {"mappings": 8, "curve": 32, "program": 32}
+UPLOAD_ITEMS_MAX = {"mappings": 8, "curve": 32, "program": 18}
 """Most items of a message of an upload: what an RP2040 checks in 2 ms, so that no frame waits long for it."""
 
 ACCEL_MIN_Q24 = 2
@@ -272,9 +273,9 @@ def alpha_q26(tau_s: float, frame_rate_hz: int) -> int:
 
 
 def items_per_message(name: str) -> int:
-    """Return how many items a message of this name has room for."""
+    """Return how many items a message of this name is sent with at most."""
     fields, items = _MESSAGES[name]
-    return (codec.PAYLOAD_MAX - messages.size(fields)) // messages.size(items)
+    return (PAYLOAD_SENT_MAX - messages.size(fields)) // messages.size(items)
 
 
 def _in_parts(name: str, fields: dict[str, int], item: str, values: Sequence[int]) -> Iterator[Message]:

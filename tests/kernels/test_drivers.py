@@ -73,6 +73,7 @@ class Board:
         self.pulse = {}
         self.duty = {}
         self.output = {}
+        self.ended = []
         self.attached = {}
         self.chips = {(0, 0x40): Chip(), (0, 0x41): Chip(), (1, 0x40): Chip()}
         self.fails = 0
@@ -102,6 +103,11 @@ class Board:
 
     def servo_attach(self, pin, period_us, until_us):
         self.attached[pin] = period_us, until_us
+
+    def servo_end(self, pin):
+        self.ended.append(pin)
+        self.attached.pop(pin)
+        self.pulse.pop(pin, None)
 
     def servo_write(self, count, pin, due, pulse_q18us):
         for d in range(count):
@@ -337,11 +343,11 @@ def test_used_pins_are_those_of_outputs_and_devices():
 # --- pins
 
 
-def test_servo_is_attached_with_its_period_and_wraps_a_millisecond_after_its_turn():
+def test_servo_is_attached_with_its_period_and_wraps_when_its_turn_has_been_written():
     outputs = Outputs((DRIVER_PINS, 2), (DRIVER_PINS, 9), period_us=5000, turns={1: 4})
     outputs.attach(0, until_us=1234)
     outputs.attach(1, until_us=12000)
-    assert outputs.board.attached == {2: (5000, 2234), 9: (20000, 13000)}
+    assert outputs.board.attached == {2: (5000, 1234 + 2200), 9: (20000, 12000 + 2200)}
 
 
 def test_servo_is_written_when_it_is_attached_and_due():
@@ -352,14 +358,14 @@ def test_servo_is_written_when_it_is_attached_and_due():
     outputs.tick(0b0101)
     assert outputs.board.pulse == {2: 1500 << 18, 7: 1500 << 18}
     outputs.drivers.release(2)
-    assert outputs.board.output == {7: 0}
+    assert outputs.board.output == {} and outputs.board.ended == [7], "a pulse under way is given whole"
     outputs.drivers.release(2)
     outputs.drivers.release(3)
     outputs.drivers.attach(3, 0)
     outputs.tick(0b1111)
     assert set(outputs.board.attached) == set(outputs.board.pulse) == {2}
     outputs.drivers.quiet()
-    assert outputs.board.output == {2: 0, 7: 0}
+    assert outputs.board.output == {2: 0}
     outputs.tick(0b1111)
 
 

@@ -45,6 +45,7 @@ class Limited:
 
     def place(self, reference, position, velocity):
         self._state = [words([reference + ZERO]), words([position]), words([velocity + ZERO])]
+        self._force = words([0])  # the acceleration in force: what the limits say
 
     def tick(self, wanted, correction=0, held=False, standing=False, calm=ONE):
         """Take a tick and return (position, velocity, change of the velocity) after it."""
@@ -52,7 +53,7 @@ class Limited:
         limits = [words([limit]) for limit in self.limits]
         wanted, correction = words([wanted + ZERO]), words([correction + ZERO])
         kinds = bytes([held]), bytes([self.relative])
-        MODULE.limit(wanted, correction, *self._state, 1, *kinds, *limits, int(standing), calm)
+        MODULE.limit(wanted, correction, *self._state, 1, *kinds, *limits, self._force, int(standing), calm)
         return self.position, self.velocity, self.velocity - before
 
 
@@ -238,12 +239,14 @@ def test_limits_that_are_tightened_while_a_dof_moves_are_kept_as_soon_as_the_acc
     places = []
     for _ in range(400):
         position, _, change = dof.tick(ONE)
-        assert abs(change) <= accel
+        assert abs(change) <= ONE // 200, "it brakes with the acceleration that it had"
         places.append(position)
-    overshoot = (ONE // 20) ** 2 / (2 * accel)
+    overshoot = (ONE // 20) ** 2 / (2 * ONE // 200)
     assert max(places) <= ONE // 2 + overshoot + ONE // 20
     assert places[-1] == ONE // 2
-    assert max(abs(b - a) for a, b in itertools.pairwise(places[40:])) <= ONE // 50
+    velocities = [b - a for a, b in itertools.pairwise(places)]
+    assert max(abs(velocity) for velocity in velocities[40:]) <= ONE // 50
+    assert max(abs(b - a) for a, b in itertools.pairwise(velocities[40:])) <= accel
 
 
 @given(limits(), st.data())
@@ -290,6 +293,7 @@ def test_dofs_do_not_touch_each_other():
     alone = [Limited(start, *one, relative=bool(kind)) for start, one, kind in zip(starts, chosen, kinds, strict=True)]
     state = [words([start + ZERO for start in starts]), words(starts), words([ZERO] * count)]
     columns = [words(column) for column in zip(*chosen, strict=True)]
+    force = words([0] * count)
     for _ in range(300):
         wanted = [rng.randint(-ONE // 4, ONE * 5 // 4) for _ in range(count)]
         MODULE.limit(
@@ -300,7 +304,29 @@ def test_dofs_do_not_touch_each_other():
             bytes(count),
             kinds,
             *columns,
+            force,
             0,
             ONE,
         )
         assert list(state[1]) == [dof.tick(value)[0] for dof, value in zip(alone, wanted, strict=True)]
+
+
+def test_lower_acceleration_is_taken_up_by_braking_with_the_old_one():
+    rng = random.Random(11)
+    for _ in range(200):
+        low, high, speed, accel = far_apart(rng)
+        dof = Limited((low + high) // 2, low, high, speed, accel)
+        for _ in range(100):
+            dof.tick(rng.choice((low, high)) if rng.random() < 0.1 else high)
+        lower = max(2, accel // rng.randint(2, 200))
+        dof.limits = (low, high, speed, lower)
+        for _ in range(400):
+            position, velocity, change = dof.tick(rng.choice((low, high)) if rng.random() < 0.05 else high)
+            assert low <= position <= high, "it stays in its range whatever its speed was"
+            assert abs(change) <= max(accel, lower) and abs(velocity) <= speed
+        for _ in range(20_000):
+            if dof.tick(low)[1] == 0:
+                break
+        dof.tick(high)
+        for _ in range(200):
+            assert abs(dof.tick(rng.choice((low, high)))[2]) <= lower, "from a stand on the new one holds"

@@ -43,6 +43,8 @@ BOARD = load_checked(
 )
 
 PSM_WDSEL = 0x40010008
+PADS_BANK0 = 0x4001C000
+PAD_AFTER_RESET = 0x56  # RP2040 data sheet, table 341: its output is enabled
 IO_BANK0 = 0x40014000
 PADS_BANK0 = 0x4001C000
 ADC = 0x4004C000
@@ -233,6 +235,7 @@ def test_pin_has_its_level_before_it_drives(memory, pin, level):
     assert memory.written == [
         (GPIO_OUT_SET if level else GPIO_OUT_CLR, 1 << pin),
         (GPIO_OE_SET, 1 << pin),
+        (PADS_BANK0 + 4 * pin + 4, PAD_AFTER_RESET),
         (IO_BANK0 + 8 * pin + 4, FUNCTION_SIO),
     ]
 

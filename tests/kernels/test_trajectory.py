@@ -272,6 +272,7 @@ def next_knots(course, dofs, target_q15, before_q15, late):
         course._fade_q15,
         course._keep_q15,
         course._share_q15,
+        course._most_q24,
     )
 
 

@@ -14,7 +14,7 @@ LATE_MAX_US = 150
 """How long after its instant a tick's handler may begin: an interrupt, some bytecode, short locks."""
 
 KILL_MAX_US = 400
-AFTER_TICK_US = range(1000, 1300)
+AFTER_TICK_US = range(2200, 2500)
 """When a servo's period begins after its tick: 1 ms, and what attaching it takes in bytecode."""
 
 COUNT_NS = 320

@@ -32,10 +32,10 @@ WORKERS = 2
 TIMER_COUNT_US = 0.32
 BRIDGE_US = 50
 BRIDGE_COUNT_US = 0.008
-AFTER_TICK_US = 1000
+AFTER_TICK_US = 2200
 """A servo's period begins so long after the tick that has written its pulse, and what it takes to start a PWM slice."""
 
-WRITTEN_US = 2200
+WRITTEN_US = 3400
 """After so long a tick has written what it has to write, and before the next one."""
 
 BUSY_ACTIONS, BUSY_RATE_HZ, CALM_RATE_HZ = 30, 50, 120

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from marotte.character import response
 from marotte.limits import LimitsInUse
-from marotte.link import pack
+from marotte.link import PAYLOAD_SENT_MAX, pack
 from marotte.puppet import Character, Dof
 from marotte.puppet_file import load_puppet
 from marotte.tables import (
@@ -381,11 +381,11 @@ def test_tables_of_the_pet_fit_their_messages(name):
     assert mappings == sum(len(action.mappings) for action in puppet.actions.values())
 
 
-def test_items_per_message_fill_the_payload():
+def test_items_per_message_fill_what_is_sent_at_once():
     for name, _, fields, items in messages.MESSAGES:
         if items:
             size = messages.size(fields) + items_per_message(name) * messages.size(items)
-            assert codec.PAYLOAD_MAX - messages.size(items) < size <= codec.PAYLOAD_MAX
+            assert PAYLOAD_SENT_MAX - messages.size(items) < size <= PAYLOAD_SENT_MAX
 
 
 @pytest.mark.parametrize(

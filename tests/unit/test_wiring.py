@@ -385,7 +385,7 @@ MISTAKES = [
     ),
     (
         f'{CHIP}{A}driver="pca9685"\nchip="FACE"\nchannel=1\nrate=333\npulse_us=[1000,2950]',
-        ":10 output.A.pulse_us: the pulses are up to 2950 us long, but begin every 2949.12 us; expected ones that leave 200 us, or a lower",
+        ":10 output.A.pulse_us: the pulses are up to 2950 us long, but begin every 2949.12 us; expected ones that leave 200 us",
     ),
     # bridges
     (f'{A}driver="bridge"', ':1 output.A: has no "pwm"; expected the number of the pin at "pwm", 0..29'),

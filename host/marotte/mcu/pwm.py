@@ -13,7 +13,7 @@ from typing import NamedTuple
 Q18_BITS = 18
 SLICES = 8
 _WRITE = struct.Struct("<BI")
-_LOW, _HIGH, _ATTACH = -1, -2, -3
+_LOW, _HIGH, _END, _ATTACH = -1, -2, -3, -4
 """In the log of a pin, where anything from 0 up is an on-time; from _ATTACH down are places in the list of attachments."""
 
 
@@ -58,6 +58,10 @@ class Pins:
             if model and model.pwm:
                 model.log_us.append(at_us)
                 model.log.append(pulse_q18us)
+
+    def end(self, at_us: int, pin: int) -> None:
+        """Let a pin have no more pulses, from its next period on."""
+        self._pins[pin].end(at_us)
 
     def drive(self, at_us: int, pin: int, level: int) -> None:
         """Drive a pin to a level, whatever it was before."""
@@ -124,6 +128,10 @@ class _Pin:
         self.log.append(_ATTACH - len(self._attached))
         self._attached.append((phase, clears))
 
+    def end(self, at_us: int) -> None:
+        self.log_us.append(at_us)
+        self.log.append(_END)
+
     def drive(self, at_us: int, level: int) -> None:
         self.pwm = False
         self.log_us.append(at_us)
@@ -150,6 +158,8 @@ class _Pin:
                 self._clears = False
             elif entry >= 0:
                 self._width_ns = entry * 1000 + (1 << Q18_BITS >> 1) >> Q18_BITS
+            elif entry == _END:
+                self._width_ns = 0
             elif entry > _ATTACH:
                 self._period_ns = 0
                 self._turn(at_ns, 1 if entry == _HIGH else 0)

@@ -235,6 +235,8 @@ class UnixMcu(VirtualMcu):
             self._sent += [(at_us, part) for part in (printed, data) if part]
         elif kind == unix.ATTACHED:
             self._pins.attach(at_us, *struct.unpack("<BII", data))
+        elif kind == unix.ENDED:
+            self._pins.end(at_us, data[0])
         elif kind in (unix.DRIVEN, unix.LET_GO):
             pin, level = data if kind == unix.DRIVEN else (data[0], None)
             self._pins.drive(at_us, pin, level or 0)
