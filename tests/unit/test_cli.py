@@ -251,6 +251,28 @@ def test_save_keeps_the_flash_of_emulated_mcus_only(run):
     assert "--flash is for an emulated MCU" in err
 
 
+FLASH_PATHS = [
+    ("", "is a directory"),
+    ("absent/flash.bin", "no such file or directory"),
+    ("file/flash.bin", "not a directory"),
+    ("fifo", "is no file"),
+    ("x" * 300, "file name too long"),
+]
+
+
+@pytest.mark.parametrize("command", [["save", PET, "--robot", ROBOT, "--mcu", "rp2040"], ["mcu", "rp2040"]])
+@pytest.mark.parametrize(("path", "expected"), FLASH_PATHS, ids=[expected for _, expected in FLASH_PATHS])
+def test_flash_that_cannot_be_a_file_is_told_before_anything_starts(
+    run, tmp_path, monkeypatch, command, path, expected
+):
+    monkeypatch.setattr("marotte.mcu.rp2040.EmulatorProcess", lambda *_: pytest.fail("started"))
+    (tmp_path / "file").write_text("")
+    os.mkfifo(tmp_path / "fifo")
+    place = tmp_path / path
+    assert run(*command, "--flash", place) == (1, "", f"marotte: {place}: cannot keep the flash: {expected}\n")
+    assert {each.name for each in tmp_path.iterdir()} == {"file", "fifo"}
+
+
 def test_save_reports_the_mistakes_of_both_files(run, tmp_path, bad):
     robot = tmp_path / "robot.toml"
     robot.write_text("[output.NECK]\npin = 0\n")

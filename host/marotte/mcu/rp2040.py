@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
+import stat
 from pathlib import Path
 
 from marotte.errors import MarotteError
@@ -51,7 +53,7 @@ class Rp2040Mcu(VirtualMcu):
     to run: it is read at the start if it exists, overlaid with the image, and written by `close`. `core` is `"compiled"` or
     `"js"`, the slow interpreter of rp2040js. With `timed_flash` false, erasing and programming take no time.
 
-    Raises MarotteError if the emulator cannot be put together or started, or fails on the way.
+    Raises MarotteError if `flash` can be no file, if the emulator cannot be put together or started, or fails on the way.
     """
 
     kind = "rp2040"
@@ -68,9 +70,9 @@ class Rp2040Mcu(VirtualMcu):
         if core not in ("compiled", "js"):
             raise ValueError(f'core must be "compiled" or "js", not {core!r}')
         self.link = _checked_link(link)
+        self._flash = None if flash is None else _checked_flash(flash)
         self._image = _checked_image(image)
         self._image_sha256 = hashlib.sha256(self._image.read_bytes()).hexdigest()
-        self._flash = Path(flash) if flash is not None else None
         self._now_us = 0
         self._next_us: int | None = 0
         self._to_send: list[tuple[int, str, str]] = []
@@ -221,3 +223,28 @@ def _checked_image(image: Path | str | None) -> Path:
     if not Path(image).is_file():
         raise MarotteError(f"{image}: no such image: expected a UF2 file")
     return Path(image)
+
+
+def _checked_flash(flash: Path | str) -> Path:
+    """Return the path of a file that can be read now, if it exists, and written at the end."""
+    path = Path(flash)
+    reason = None
+    try:
+        if stat.S_ISREG(path.stat().st_mode) or path.is_dir():
+            path.open("r+b").close()
+        else:
+            reason = "is no file"
+    except FileNotFoundError as error:
+        if not path.parent.is_dir():
+            reason = _reason(error)
+        elif not os.access(path.parent, os.W_OK | os.X_OK):
+            reason = "permission denied"
+    except OSError as error:
+        reason = _reason(error)
+    if reason:
+        raise MarotteError(f"{path}: cannot keep the flash: {reason}")
+    return path
+
+
+def _reason(error: OSError) -> str:
+    return (error.strerror or str(error)).lower()
