@@ -32,6 +32,8 @@ from marotte.view import View
 from marotte.wiring import Robot
 
 PUMP_US = 20_000
+GONE = {"rest": "goes to rest", "relax": "goes to rest and lets go"}
+"""What a puppet does when the host is gone, by its `when_silent`; with any other it goes on."""
 
 
 def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console: Console) -> None:
@@ -139,6 +141,8 @@ def _save(what: Keeping | None, session: Session, name: str, console: Console) -
     outputs = "its outputs are armed by themselves" if what.robot.autostart else "its outputs are off until it is armed"
     _say(console, f"{what.puppet.name} is kept on the flash of {name}")
     _say(console, f"switched on, it {does}; {outputs}")
+    if what.puppet.when_silent in GONE:
+        _say(console, f"once a host has come and gone, it {GONE[what.puppet.when_silent]}")
 
 
 @dataclass(frozen=True)

@@ -70,6 +70,23 @@ def test_saved_puppet_plays_when_the_mcu_is_switched_on(tmp_path, flash, puppet,
         assert playing == set(puppet.behaviours["HAPPY"])
 
 
+@pytest.mark.parametrize(
+    ("when_silent", "expected"),
+    [
+        ("idle", ""),
+        ("rest", "once a host has come and gone, it goes to rest\n"),
+        ("relax", "once a host has come and gone, it goes to rest and lets go\n"),
+    ],
+)
+def test_save_says_what_the_puppet_does_when_a_host_is_gone(tmp_path, flash, when_silent, expected, capsys):
+    puppet = tmp_path / "puppet.toml"
+    puppet.write_text(f'when_silent = "{when_silent}"\n[dof.NECK]\n')
+    robot = write_robot(tmp_path, "false")
+    assert cli.main(["save", str(puppet), "--robot", str(robot), "--mcu", "unix", "--flash", str(flash)]) == 0
+    first, _, rest = capsys.readouterr().out.split("\n", 2)
+    assert (first, rest) == ("puppet is kept on the flash of the emulated unix", expected)
+
+
 def test_save_replaces_what_plays_by_itself(tmp_path, flash):
     save = ["--mcu", "unix", "--flash", str(flash)]
     robot = str(write_robot(tmp_path, "true"))
