@@ -155,8 +155,8 @@ class Link:
                     status = self.commands.carry_out(message_id, body, length - codec.OVERHEAD)
                 finally:
                     micropython.heap_lock()
-            elif message_id == messages.ARM and self._kills:  # a kill that came after it has overtaken it
-                status = messages.STATE
+            elif message_id == messages.ARM and self._kills:  # a kill that is to follow it has overtaken it
+                status = messages.OK
             else:
                 status = self.commands.carry_out(message_id, body, length - codec.OVERHEAD)
             detail = self.commands.detail

@@ -209,6 +209,7 @@ class Link:
         """
         command = _Command(name, pack(name, fields or {}, items), on_refused)
         if urgent and len(self._under_way) < URGENT_WINDOW:
+            self._carrier.write(b"\0")  # the end of whatever has lost its own
             self._send(command)
         else:
             self._backlog.append(command)
