@@ -54,13 +54,14 @@ def _collect(chunk: ptr8, start: int, end: int, wire: ptr8, length: int, room: i
 class Link:
     """Receives and answers for one puppet.
 
-    `packets` and `damaged` count what came. `commands`, `telemetry` and `store` are its parts. A packet to send is put
+    `packets` and `damaged` count what came, `is_behind` tells that more may have come than `poll` has taken. `commands`, `telemetry` and `store` are its parts. A packet to send is put
     into `out`, two bytes of head first, and sent by `send`.
     """
 
     def __init__(self, board, puppet):
         self.packets = 0
         self.damaged = 0
+        self.is_behind = False
         self.out = bytearray(codec.BODY_MAX)
         self.telemetry = Telemetry(board, puppet, self)
         self.store = Store()
@@ -95,6 +96,7 @@ class Link:
                 return True
         else:
             end = board.receive(chunk)
+        self.is_behind = end == len(chunk)
         if end == 0:
             return False
         if self._length and ticks_diff(now_us, self._byte_us) > _STALE_US:

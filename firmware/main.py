@@ -15,6 +15,7 @@ from firmware.puppet import Puppet
 from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
+_CHUNKS = 4  # of bytes that are taken in one pass while no frame is due
 _WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board; a USB write may take 1100
 
 
@@ -26,8 +27,11 @@ def _pass(board, puppet, link):
     MicroPython then keeps the locals of larger functions on the stack, instead of looking through the heap for room, which costs
     200 us a call once it is half full.
     """
-    if link.poll():
-        return None
+    for _ in range(_CHUNKS):
+        if link.poll():
+            return None
+        if not link.is_behind or (puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0):
+            break
     if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0:
         puppet.step()
         link.report()

@@ -122,6 +122,7 @@ class Motor:
         self._kill_pin = NO_PIN
         self._kill_level = 0
         self._maintained = 0
+        self._unsettled = False
         self._calm_q24 = 0
         self._glide_q4us = 0
         self._timeout_ticks = 1
@@ -197,6 +198,7 @@ class Motor:
         self.trajectory.load(tables)
         self.trajectory.hold(tables.dofs, self.position_q24)
         self._take_over(tables)
+        self._settle()
         self._since = self.ticks
         self._times_us[2] = _UNKNOWN_US
         board.start_ticks(tables.motor_period_us, self.tick)
@@ -212,12 +214,14 @@ class Motor:
         if _same_dofs(tables, before):
             self.tables = tables
             self._take_over(tables)
+            self._unsettled = True
             return
         self._paused = True
         self.feedback.pause()
         self.tables = tables
         self._rearrange(before, tables, gather_words, gather_halves, scratch)
         self._take_over(tables)
+        self._unsettled = True
         self._paused = False
         self._board.kept_pose(0, self.position_q24, _tag(tables))  # from now on it is kept under the new tag
 
@@ -379,13 +383,22 @@ class Motor:
         self._later = 0
         board.unlock(state)
         self._drivers.flush(self._level_q24, self._pulse_q18us, due)
-        self.guards.attend(now_us, self.silent and self.tables.when_silent == SILENT_RELAX)
+        if not self._unsettled:
+            self.guards.attend(now_us, self.silent and self.tables.when_silent == SILENT_RELAX)
 
     def maintain(self):
         """Let drivers set up their devices and find those that have come back, once a tick. May allocate."""
+        if self._unsettled:
+            self._settle()
         if self.ticks != self._maintained:
             self._maintained = self.ticks
             self._drivers.attend(self._board.ticks_us())
+
+    def _settle(self):
+        """Let error correction and guards take over the tables; corrections stay as they are until then."""
+        self.feedback.load(self.tables)
+        self.guards.load()
+        self._unsettled = False
 
     # --- the tick
 
@@ -510,8 +523,6 @@ class Motor:
 
     def _take_over(self, tables):
         self._character.load(tables)
-        self.feedback.load(tables)
-        self.guards.load()
         if tables.kill_pin != self._kill_pin:
             self._kill_pin = NO_PIN
             if tables.kill_pin != NO_PIN:

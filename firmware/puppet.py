@@ -28,8 +28,9 @@ from shared.formats import (
     WEIGHT_ONE,
 )
 
-_COLLECT_US = const(12000)  # what the heap's collection takes on an RP2040
+_COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
 _CARRY_US = const(16000)  # what putting other tables into force takes
+_MARGIN_US = const(3000)  # between the end of a frame and what is done then
 
 
 class Puppet:
@@ -79,7 +80,6 @@ class Puppet:
         self.hold_state = (self._hold_target_q28, self._hold_x_q28, self._hold_w_q28)
         self.exchange = Exchange(self)
         self._exchange_due = False
-        self._waits_in = -1
         self._tempos_changed = 0
 
     def commit(self):
@@ -112,30 +112,28 @@ class Puppet:
     def prepare(self):
         """Take a step of what an exchange of tables needs between frames; return whether there was one to take.
 
-        The last two collect what tables leave on the heap, so that it does not fill up in the middle of a frame, and put the new
-        tables into force. They wait until there is time for that, but no longer than for the end of the next frame.
+        The last two collect what tables leave on the heap, so that it does not fill up in the middle of a frame, and put the
+        new tables into force. They wait until there is time for that.
         """
         if self.exchange.step < 0:
             return False
         if self._exchange_due:
-            if self._has_time(_CARRY_US):
-                self._exchange_due = False
-                self.exchange.carry_over()
-                self._tempos_changed = 1
-                return True
-        elif not self.exchange.prepare():
-            self._waits_in = self.frame
-            return True
-        elif self._has_time(_COLLECT_US):
+            if not self._has_time(_CARRY_US):
+                return False
+            self._exchange_due = False
+            self.exchange.carry_over()
+            self._tempos_changed = 1
+        elif self.exchange.prepare():
+            if not self._has_time(_COLLECT_US):
+                return False
             gc.collect()
             self._exchange_due = True
-            self._waits_in = self.frame
-            return True
-        return False
+        return True
 
     def _has_time(self, need_us):
-        """Return whether so much time is left until the next frame, or as much as there will ever be."""
-        return self.frame != self._waits_in or self.clock.until_us(self._board.ticks_us()) >= need_us
+        """Return whether so much time is left until the next frame, or as much as there is behind any."""
+        most_us = 1000000 // self.clock.rate_hz - self.frame_max_us - _MARGIN_US
+        return self.clock.until_us(self._board.ticks_us()) >= min(need_us, most_us)
 
     def step(self):
         """Compute the frame that is due and hand it to the motors."""
