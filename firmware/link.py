@@ -54,8 +54,8 @@ def _collect(chunk: ptr8, start: int, end: int, wire: ptr8, length: int, room: i
 class Link:
     """Receives and answers for one puppet.
 
-    `packets` and `damaged` count what came, `is_behind` tells that more may have come than `poll` has taken. `commands`, `telemetry` and `store` are its parts. A packet to send is put
-    into `out`, two bytes of head first, and sent by `send`.
+    `packets` and `damaged` count what came, `is_behind` tells that more may have come than `poll` has taken. `commands`,
+    `telemetry` and `store` are its parts. A packet to send is put into `out`, two bytes of head first, and sent by `send`.
     """
 
     def __init__(self, board, puppet):
