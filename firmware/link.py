@@ -98,10 +98,10 @@ class Link:
             end = board.receive(chunk)
         self.is_behind = end == len(chunk)
         if end == 0:
+            if self._length and ticks_diff(now_us, self._byte_us) > _STALE_US:
+                self._length = 0
+                self.damaged += 1
             return False
-        if self._length and ticks_diff(now_us, self._byte_us) > _STALE_US:
-            self._length = 0
-            self.damaged += 1
         start = 0
         while start < end:
             stop = _collect(chunk, start, end, wire, self._length, codec.WIRE_MAX)

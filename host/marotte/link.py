@@ -21,13 +21,13 @@ from marotte.errors import MarotteError
 from marotte.mcu.base import VirtualMcu
 from shared import codec, messages
 
-WINDOW = 4
+WINDOW = 3
 URGENT_WINDOW = 8
 """The same for urgent ones; the MCU remembers its last 16 answers."""
 
 WINDOW_BYTES = 128
-"""The MCU takes some 50 us for a byte, a UART at 115200 baud 87, and up to 2 ms to carry a command out. With no more on
-the way, a `kill` that overtakes what waits acts within 20 ms.
+"""The MCU takes some 50 us for a byte, a UART at 115200 baud 87, and 2 to 5 ms to carry out a part of an upload, at a motor
+rate of 333 Hz half as much again. With no more on the way, a `kill` that overtakes what waits acts within 20 ms.
 """
 
 PAYLOAD_SENT_MAX = 80
