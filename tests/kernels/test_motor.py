@@ -69,6 +69,7 @@ class Board:
             if calls:
                 self.handler()
             motor.attend()
+            motor.maintain()
 
     def ticks_us(self):
         return self.now_us % TICKS_MODULUS
