@@ -233,13 +233,13 @@ run(40)
         pulses = pulses_of(board.mcu.edges(pin))
         starts.append(pulses[0][0])
         assert {after - before for (before, _), (after, _) in itertools.pairwise(pulses)} == {period_us * 1000}
-        assert len(pulses) >= 39
-        for n, (_, width_ns) in enumerate(pulses[:39], start=1):
+        assert len(pulses) >= 38, "the last one is cut by the end of it all"
+        for n, (_, width_ns) in enumerate(pulses[:38], start=1):
             assert abs(width_ns - 1000 * (1000 + 100 * d + n / 4)) <= COUNT_NS
     assert starts[0] == starts[1], "one slice"
 
 
-def test_servo_period_begins_a_millisecond_after_its_tick(board):
+def test_servo_period_begins_when_its_tick_has_been_written(board):
     told = board("""
 play([(0, 2), (0, 7)])
 attach(0, 1)
