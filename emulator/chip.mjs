@@ -1,12 +1,15 @@
 // One life of the RP2040, from a reset to the next: rp2040js's chip with our clock, CPU core, memories and corrections.
 
 import { RP2040 } from 'rp2040js';
+import { connectAdc } from './adc.mjs';
 import { BOOT_PORT_ADDRESS, BootPort } from './boot_port.mjs';
 import { VirtualClock } from './clock.mjs';
-import { QuietLogger, correct, keepWatchdogState, onWatchdogReset } from './corrections.mjs';
+import { QuietLogger, correct, onBlockReset, keepWatchdogState, onWatchdogReset } from './corrections.mjs';
 import { addCore1 } from './core1.mjs';
 import { Cpu } from './cpu.mjs';
 import { IoQspi, Ssi } from './flash.mjs';
+import { I2cController } from './i2c_controller.mjs';
+import { followPins } from './i2c_wires.mjs';
 import { Uart } from './uart.mjs';
 import { UsbHost } from './usb_host.mjs';
 
@@ -15,14 +18,19 @@ const SSI = 0x18000;
 const IO_QSPI = 0x40018;
 const UART0 = 0x40034;
 const UART0_IRQ = 20;
+const I2C = [
+  { name: 'I2C0', page: 0x40044, irq: 23, resetBit: 3 },
+  { name: 'I2C1', page: 0x40048, irq: 24, resetBit: 4 },
+];
 
 export class Chip {
   /**
    * `core`: the CPU core, with the memories that outlive a reset. `flash`: the NorFlash.
    * `onData(link, bytes)`: called when data has left the chip by "usb" or "uart".
+   * `buses`: the I2cBus at each controller, and `wires` the I2cWires of each. `analog`: the ADC's AnalogInputs.
    * `before`: the life before, if there was one.
    */
-  constructor({ core, flash, logger = new QuietLogger(), onData, before = null }) {
+  constructor({ core, flash, logger = new QuietLogger(), onData, buses, wires, analog, before = null }) {
     this.clock = new VirtualClock();
     this.mcu = new RP2040(this.clock);
     this.mcu.logger = logger;
@@ -45,6 +53,18 @@ export class Chip {
     this.uart = new Uart(this.mcu, 'UART0', UART0_IRQ, (byte) => onData('uart', Uint8Array.of(byte)));
     this.mcu.uart[0] = this.uart;
     this.mcu.peripherals[UART0] = this.uart;
+    connectAdc(this.mcu, analog);
+    this.i2c = I2C.map(({ name, irq }, number) => new I2cController(this.mcu, name, irq, buses[number]));
+    this.i2c.forEach((controller, number) => {
+      this.mcu.peripherals[I2C[number].page] = controller;
+      onBlockReset(this.mcu, I2C[number].resetBit, () => controller.reset());
+    });
+    followPins(this.mcu, wires);
+  }
+
+  /** SDA of a bus got stuck or came free. */
+  busChanged(number) {
+    this.i2c[number].busChanged();
   }
 
   requestReset() {

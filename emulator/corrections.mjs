@@ -3,10 +3,13 @@
 import { BasePeripheral } from 'rp2040js';
 
 const XIP_CTRL = 0x14000;
+const RESETS = 0x4000c;
+const PSM = 0x40010;
 const TIMER = 0x40054;
 const WATCHDOG = 0x40058;
 const ROSC = 0x40060;
 const VREG_AND_CHIP_RESET = 0x40064;
+const PSM_PROC0 = 1 << 15;
 const ROSC_STATUS_STABLE = [0x18, 0x81001000];
 const ROSC_RANDOMBIT = [0x1c, 1];
 
@@ -46,6 +49,17 @@ function alarmOnTheMicrosecond(mcu, timer) {
   };
 }
 
+/** Call `callback` when the firmware resets one of the chip's blocks; rp2040js only takes note of the bit. */
+export function onBlockReset(mcu, bit, callback) {
+  const resets = mcu.peripherals[RESETS];
+  const write = resets.writeUint32;
+  resets.writeUint32 = (offset, value) => {
+    const before = resets.reset;
+    write.call(resets, offset, value);
+    if (resets.reset & ~before & (1 << bit)) callback();
+  };
+}
+
 /** What survives a reset by the watchdog: its scratch registers, and the reason for the reset. */
 export function keepWatchdogState(from, to) {
   const [before, after] = [from.peripherals[WATCHDOG], to.peripherals[WATCHDOG]];
@@ -53,11 +67,15 @@ export function keepWatchdogState(from, to) {
   after.reason = before.reason;
 }
 
+/**
+ * Call `callback` when the watchdog resets the chip. It does only what the firmware has chosen in the power-on state machine
+ * (RP2040 data sheet, section 2.13.5), nothing by default; here the choice is that of the processor, and then all is reset.
+ */
 export function onWatchdogReset(mcu, callback) {
   const watchdog = mcu.peripherals[WATCHDOG];
   watchdog.onWatchdogTrigger = () => {
     watchdog.timer.enable = false; // it would go off again in the same instant, for ever
-    callback();
+    if (mcu.peripherals[PSM].wdsel & PSM_PROC0) callback();
   };
 }
 

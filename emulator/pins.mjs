@@ -1,17 +1,19 @@
 // The pins seen from outside: edges of the outputs, levels driven into the inputs, pulls, and each driven output read back.
 
 import { GPIOPinState } from 'rp2040js';
+import { Edges } from './edges.mjs';
 import { EmulatorError } from './errors.mjs';
 
-export const MAX_EDGES_PER_PIN = 1 << 20;
 const PIN_COUNT = 30;
 
 class Pin {
-  constructor() {
+  constructor(index) {
     this.outside = null; // the level driven from outside: true, false, or null
+    this.heldLow = false; // whether a device pulls it low, as on an I2C bus
     this.output = false; // whether the chip drives it high
-    this.edges = []; // nanoseconds and level, alternating
-    this.lost = false;
+    this.level = false; // what an input reads
+    this.edges = new Edges(`pin ${index}`);
+    this.watchers = [];
   }
 }
 
@@ -19,7 +21,7 @@ export class Pins {
   /** `now` gives the time since power on, in nanoseconds. */
   constructor(now) {
     this.now = now;
-    this.pins = Array.from({ length: PIN_COUNT }, () => new Pin());
+    this.pins = Array.from({ length: PIN_COUNT }, (_, index) => new Pin(index));
   }
 
   /** Connect the pins to a chip that has just been reset: all outputs let go. */
@@ -36,15 +38,30 @@ export class Pins {
     const output = state === GPIOPinState.High;
     if (output !== pin.output) {
       pin.output = output;
-      this.record(pin);
+      pin.edges.add(this.now(), output);
     }
-    const level = inputLevel(state, pin.outside);
+    const level = inputLevel(state, pin);
     if (level !== gpio.rawInputValue) gpio.setInputValue(level);
+    if (level === pin.level) return;
+    pin.level = level;
+    for (const watcher of pin.watchers) watcher(level);
   }
 
-  record(pin) {
-    if (pin.edges.length < 2 * MAX_EDGES_PER_PIN) pin.edges.push(Math.round(this.now()), pin.output ? 1 : 0);
-    else pin.lost = true;
+  /** Call `watcher(level)` whenever the level at a pin changes, whoever drives it, through all resets. */
+  watch(index, watcher) {
+    this.pin(index).watchers.push(watcher);
+  }
+
+  level(index) {
+    return this.pin(index).level;
+  }
+
+  /** Let a device pull a pin low, or let go of it. */
+  hold(index, low) {
+    const pin = this.pin(index);
+    if (low === pin.heldLow) return;
+    pin.heldLow = low;
+    this.update(pin, this.gpio[index]);
   }
 
   /** Drive a pin from outside: 0, 1, or null to let go. */
@@ -56,16 +73,11 @@ export class Pins {
 
   /** Edges of an output since they were cleared: nanoseconds and level, alternating. */
   edges(index) {
-    const pin = this.pin(index);
-    if (pin.lost) throw new EmulatorError(`pin ${index} had more than ${MAX_EDGES_PER_PIN} edges: clear them more often`);
-    return pin.edges;
+    return this.pin(index).edges.read();
   }
 
   clearEdges() {
-    for (const pin of this.pins) {
-      pin.edges = [];
-      pin.lost = false;
-    }
+    for (const pin of this.pins) pin.edges.clear();
   }
 
   pin(index) {
@@ -75,9 +87,9 @@ export class Pins {
   }
 }
 
-/** What an input reads: the chip's own output, else what drives it from outside, else its pull. */
-function inputLevel(state, outside) {
+/** What an input reads: the chip's own output, else what pulls it low or drives it from outside, else its pull. */
+function inputLevel(state, { heldLow, outside }) {
   if (state === GPIOPinState.High) return true;
-  if (state === GPIOPinState.Low) return false;
+  if (state === GPIOPinState.Low || heldLow) return false;
   return outside ?? state === GPIOPinState.InputPullUp;
 }

@@ -6,6 +6,12 @@
 //   {"op": "edges", "pin": N}                ->  {"edges": [NS, LEVEL, NS, LEVEL, ...]}
 //   {"op": "clear_edges"}                    ->  {}
 //   {"op": "pin", "pin": N, "level": 0, 1 or null}  ->  {}
+//   {"op": "adc", "pin": N, "ratio": X}      ->  {}
+//   {"op": "add_pca9685", "bus": N, "address": N, "oe_pin": N or null, "clock_hz": X}  ->  {"device": N}
+//   {"op": "device_edges", "device": N, "channel": N}  ->  {"edges": [NS, LEVEL, NS, LEVEL, ...]}
+//   {"op": "device_registers", "device": N}  ->  {"registers": [N, ...]}
+//   {"op": "device_present", "device": N, "present": BOOLEAN}  ->  {}
+//   {"op": "i2c_stuck", "bus": N, "stuck": BOOLEAN}  ->  {}
 //   {"op": "host_reading", "reading": BOOLEAN}  ->  {}
 //   {"op": "report"}                         ->  {"instructions": N, ...}
 //   {"op": "state"}                          ->  {"registers": [N, ...], "ram_sha256": HEX, ...}
@@ -30,12 +36,33 @@ const OPERATIONS = {
   edges: (machine, { pin }) => ({ edges: machine.pins.edges(pin) }),
 
   clear_edges(machine) {
-    machine.pins.clearEdges();
+    machine.clearEdges();
     return {};
   },
 
   pin(machine, { pin, level }) {
     machine.pins.set(pin, level);
+    return {};
+  },
+
+  adc(machine, { pin, ratio }) {
+    machine.analog.set(pin, ratio);
+    return {};
+  },
+
+  add_pca9685: (machine, { bus, address, oe_pin, clock_hz }) => ({ device: machine.addPca9685(bus, address, oe_pin, clock_hz) }),
+
+  device_edges: (machine, { device, channel }) => ({ edges: machine.device(device).readEdges(channel) }),
+
+  device_registers: (machine, { device }) => ({ registers: Array.from(machine.device(device).registers) }),
+
+  device_present(machine, { device, present }) {
+    machine.setDevicePresent(device, present);
+    return {};
+  },
+
+  i2c_stuck(machine, { bus, stuck }) {
+    machine.setI2cStuck(bus, stuck);
     return {};
   },
 

@@ -1,86 +1,51 @@
 """The board on a PC: MicroPython's unix port in virtual time, for tests, renderings and trying things out.
 
-Virtual time advances only when the host says so. Each of the host's commands is a stretch of time together with the
-bytes that arrive in it; the board runs through it, skipping all waiting, tells what it sent and did, and stops at its
-end. Computing takes no time. All offsets count from the beginning of the stretch.
-
-Commands (file 1, little-endian):  length_us u32 (at most 2^29), size u32, then `size` bytes: offset_us u32, count u16,
-bytes, repeated. Records (file 2): kind u8, offset_us u32, count u16, bytes. `S` bytes sent, `P` pulses (pin u8,
-pulse_q4us u16, repeated), `Q` all pins quiet, `D` the stretch is done.
+It has the pins, the PWM, the analogue inputs and the I2C buses of a Pico: it tells the host what is written to them, and is
+told what they read. `unix_time.py` has the rest.
 """
 
 import gc
-from struct import pack_into, unpack_from
+from array import array
+from struct import pack_into
 
 from micropython import const
 
-from firmware.clock import TICKS_MASK
+from firmware.unix_time import VirtualTime
 
-_RECORD = const(7)
-_ROOM = const(4096)
-_RETURN = const(13)
-_CTRL_C = const(3)
+_PINS = const(30)
+_KEPT = const(17)  # words: a tag, then a pose, each value beside its complement
+_BRIDGE_US = const(50)
+_NO_PIN = const(255)
+_UNDRIVEN = const(2)
+_EIO = const(5)
+_PULLED_UP = const(1)  # uses of a pin; 0: it floats
+_LOW = const(2)
+_HIGH = const(3)
+_PWM = const(4)
 
 
-class Board:
-    """A PC that stands in for a Pico, with the same pins. `commands` and `records` are binary files."""
+class Board(VirtualTime):
+    """A PC that stands in for a Pico, with the same pins. `commands` and `records` are binary files.
 
-    def __init__(self, commands, records):
-        self._commands = commands
-        self._records = records
-        self._header = bytearray(8)
-        self._arrivals = b""
-        self._next = 0  # place of the next arrival
-        self._count = 0  # its bytes that are left, and their place
-        self._at = 0
-        self._start_us = 0  # ticks at the beginning of the stretch
-        self._offset_us = 0
-        self._length_us = 0
-        self._out = bytearray(_ROOM)
-        self._used = 0
-        self._attached = bytearray(29)
+    `kept` names a file that stands in for the RAM that a reset leaves as it is, `resets` is how often the watchdog has
+    reset the MCU since power on. It is made when the host has given the first stretch, and knows what has arrived by then.
+    """
 
-    def ticks_us(self):
-        """Return virtual time in microseconds, modulo 2^30."""
-        return (self._start_us + self._offset_us) & TICKS_MASK
+    def __init__(self, commands, records, kept=None, resets=0):
+        super().__init__(commands, records, resets)
+        self._use = bytearray(_PINS)
+        self._outside = bytearray(_UNDRIVEN for _ in range(_PINS))
+        self._analog_q12 = array("H", bytes(2 * _PINS))
+        self._adc_q15 = 0
+        self._present = set()
+        self._kept_file = kept
+        self._kept = array("H", bytes(4 * _KEPT))
+        self._kept_changed = False
+        self._tag = 0
+        self._read_kept()
+        self._begin()
 
-    def wait(self, longest_us):
-        """Let virtual time pass until a byte arrives, at most `longest_us`."""
-        end_us = self._offset_us + longest_us
-        while not self._arrived():
-            arrival_us = self._arrival_us()
-            next_us = end_us if arrival_us < 0 or arrival_us > end_us else arrival_us
-            if next_us <= self._length_us:
-                self._offset_us = next_us
-                if next_us == end_us:
-                    return
-            else:
-                end_us -= self._length_us
-                self._next_stretch()
-
-    def receive(self, buffer):
-        """Read what has arrived into `buffer`, at most its length; return the number of bytes. Never waits.
-
-        `0D 03` ends a read: if it calls for the REPL, what follows is meant for that.
-        """
-        count = 0
-        room = len(buffer)
-        while count < room and self._arrived():
-            byte = self._arrivals[self._at]
-            buffer[count] = byte
-            count += 1
-            self._at += 1
-            self._count -= 1
-            if byte == _CTRL_C and (count == 1 or buffer[count - 2] == _RETURN):
-                break
-        return count
-
-    def send(self, buffer, length):
-        """Send the first `length` bytes of `buffer`."""
-        at = self._record(b"S", length)
-        out = self._out
-        for i in range(length):
-            out[at + i] = buffer[i]
+    # --- pins
 
     def is_output(self, pin):
         """Return whether a servo may hang on this pin; the pins are those of a Pico."""
@@ -90,84 +55,173 @@ class Board:
         """Return whether two pins are outputs of the same PWM channel."""
         return pin & 15 == other & 15
 
-    def attach(self, pin):
-        """Let a pin have pulses."""
-        self._attached[pin] = 1
+    def same_slice(self, pin, other):
+        """Return whether two pins belong to the same PWM slice and so have one period."""
+        return (pin >> 1) & 7 == (other >> 1) & 7
 
-    def pulses(self, count, pin, pulse_q4us):
-        """Record the pulse widths of `count` DOFs: `pulse_q4us[d]` on `pin[d]` where that is attached."""
+    def input_pullup(self, pin):
+        """Make a pin an input that is high if nobody drives it."""
+        self._use[pin] = _PULLED_UP
+        self._out[self._record(b"Z", 1)] = pin
+
+    def level(self, pin):
+        """Return the level at a pin, 0 or 1."""
+        use = self._use[pin]
+        if use == _LOW or use == _HIGH:
+            return use & 1
+        outside = self._outside[pin]
+        return outside if outside != _UNDRIVEN else use & 1
+
+    def drive(self, pin, level):
+        """Make a pin an output of this level, whatever it was before."""
+        self._use[pin] = _HIGH if level else _LOW
+        at = self._record(b"L", 2)
+        self._out[at] = pin
+        self._out[at + 1] = 1 if level else 0
+
+    def servo_attach(self, pin, period_us, until_wrap_us):
+        """Give a pin to its PWM slice: periods of `period_us`, one of which ends in `until_wrap_us`. No pulse yet."""
+        self._use[pin] = _PWM
+        pack_into("<BII", self._out, self._record(b"A", 9), pin, period_us, until_wrap_us)
+
+    def servo_write(self, count, pin, due, pulse_q18us):
+        """Set `pulse_q18us[d]` at `pin[d]`, from its next period on, for each `d` below `count` whose bit is set in `due`."""
         length = 0
         for d in range(count):
-            if pin[d] < 29 and self._attached[pin[d]]:
-                length += 3
+            if due >> d & 1 and pin[d] != _NO_PIN:
+                length += 5
+        if length == 0:
+            return
         at = self._record(b"P", length)
+        out = self._out
         for d in range(count):
-            if pin[d] < 29 and self._attached[pin[d]]:
-                self._out[at] = pin[d]
-                self._out[at + 1] = pulse_q4us[d] & 255
-                self._out[at + 2] = pulse_q4us[d] >> 8
-                at += 3
+            if due >> d & 1 and pin[d] != _NO_PIN:
+                out[at] = pin[d]
+                pack_into("<I", out, at + 1, pulse_q18us[d])
+                at += 5
 
-    def release(self, pin):
-        """Take the pulses of one pin away."""
-        self._attached[pin] = 0
-        self._out[self._record(b"R", 1)] = pin
+    def servo_end(self, pin):
+        """Give a pin no more pulses, from its next period on."""
+        self._out[self._record(b"E", 1)] = pin
+
+    def bridge_attach(self, pin):
+        """Give a pin to its PWM slice at 20 kHz, low."""
+        self.servo_attach(pin, _BRIDGE_US, _BRIDGE_US)
+
+    def bridge_write(self, pin, duty_q16):
+        """Let a pin be high for a part of each 50 us, 65536 being all of it."""
+        pack_into("<BI", self._out, self._record(b"P", 5), pin, duty_q16 * (_BRIDGE_US << 2))
+
+    def pin_low(self, pin):
+        """Drive a pin low at once and take it from its PWM slice."""
+        self.drive(pin, 0)
 
     def quiet(self):
-        """Take all pulses away."""
-        for pin in range(29):
-            self._attached[pin] = 0
+        """Drive all PWM pins low at once."""
+        for pin in range(_PINS):
+            if self._use[pin] == _PWM:
+                self._use[pin] = _LOW
         self._record(b"Q", 0)
+
+    # --- analogue inputs and I2C
+
+    def adc_start(self, pin):
+        """Measure the voltage at a pin."""
+        level_q12 = self._analog_q12[pin]
+        self._adc_q15 = (level_q12 << 3) + ((level_q12 + 256) >> 9)
+
+    def adc_read(self):
+        """Return what was measured last, 32768 being the supply; the converter's 4095 is that."""
+        return self._adc_q15
+
+    def i2c(self, sda, scl, baud_hz):
+        """Return the I2C bus at two pins."""
+        return _Bus(self, (sda >> 1) & 1)
+
+    # --- what a reset leaves
+
+    def keep_pose(self, dofs, position_q24):
+        """Keep a pose where a reset leaves it, to Q15, under the tag that `kept_pose` was last called with."""
+        if self._tag == 0:  # no robot yet: what a reset has left stays
+            return
+        kept = self._kept
+        kept[0] = self._tag & 0xFFFF
+        kept[1] = self._tag >> 16
+        for d in range(dofs):
+            value_q15 = (position_q24[d] + 256) >> 9
+            kept[2 * d + 2] = value_q15
+            kept[2 * d + 3] = value_q15 ^ 0xFFFF
+        self._kept_changed = True
+
+    def kept_pose(self, dofs, position_q24, tag):
+        """Read the pose that was kept under a tag; return whether there was one. From now on poses are kept under it."""
+        self._tag = tag
+        kept = self._kept
+        if kept[0] | kept[1] << 16 != tag:
+            return False
+        for d in range(dofs):
+            if kept[2 * d + 2] ^ kept[2 * d + 3] != 0xFFFF:
+                return False
+        for d in range(dofs):
+            position_q24[d] = kept[2 * d + 2] << 9
+        return True
 
     def heap_free(self):
         """Return the free bytes of the heap."""
         return gc.mem_free()
 
     def close(self):
-        """Leave no pulses behind."""
+        """Leave no pulses behind, no ticks and no watchdog."""
+        self.stop_ticks()
+        self.watchdog_off()
         self.quiet()
 
-    def _arrival_us(self):
-        """Return the offset of the next arrival in this stretch, -1 if there is none."""
-        if self._count:
-            return self._offset_us
-        if self._next >= len(self._arrivals):
-            return -1
-        return unpack_from("<I", self._arrivals, self._next)[0]
+    def _set_input(self, kind, data):
+        """Take the level at a pin, at an analogue input, or whether an I2C device is there."""
+        if kind == 1:
+            self._outside[data[0]] = data[1]
+        elif kind == 2:
+            self._analog_q12[data[0]] = data[1] | data[2] << 8
+        else:
+            device = data[0] << 7 | data[1]
+            if data[2]:
+                self._present.add(device)
+            else:
+                self._present.discard(device)
 
-    def _arrived(self):
-        """Return whether a byte can be read now."""
-        while self._count == 0:
-            if not 0 <= self._arrival_us() <= self._offset_us:
-                return False
-            self._count = unpack_from("<H", self._arrivals, self._next + 4)[0]
-            self._at = self._next + 6
-            self._next = self._at + self._count
-        return True
+    def _read_kept(self):
+        if self._kept_file:
+            try:
+                with open(self._kept_file, "rb") as file:
+                    file.readinto(self._kept)
+            except OSError:
+                pass  # nothing was kept
 
-    def _next_stretch(self):
-        """Tell that this stretch is done, and wait for the host to give the next one."""
-        self._offset_us = self._length_us
-        self._record(b"D", 0)
-        self._flush()
-        if self._commands.readinto(self._header) != 8:
-            raise SystemExit  # the host has gone
-        self._start_us = (self._start_us + self._length_us) & TICKS_MASK
-        self._offset_us = 0
-        self._length_us, size = unpack_from("<II", self._header)
-        self._arrivals = self._commands.read(size)
-        self._next = 0
+    def _save(self):
+        """Put the kept pose into its file."""
+        if self._kept_file and self._kept_changed:
+            with open(self._kept_file, "wb") as file:
+                file.write(self._kept)
+            self._kept_changed = False
 
-    def _record(self, kind, length):
-        """Begin a record; return the place of its bytes."""
-        if self._used + _RECORD + length > _ROOM:
-            self._flush()
-        at = self._used
-        self._out[at] = kind[0]
-        pack_into("<IH", self._out, at + 1, self._offset_us, length)
-        self._used = at + _RECORD + length
-        return at + _RECORD
 
-    def _flush(self):
-        self._records.write(self._out, self._used)
-        self._used = 0
+class _Bus:
+    """An I2C bus."""
+
+    def __init__(self, board, number):
+        self._board = board
+        self._number = number
+
+    def writeto(self, address, data):
+        """Send bytes to a device; return their number. Raises OSError if it is not there."""
+        board = self._board
+        if self._number << 7 | address not in board._present:
+            raise OSError(_EIO)
+        length = len(data)
+        at = board._record(b"I", 2 + length)
+        out = board._out
+        out[at] = self._number
+        out[at + 1] = address
+        for i in range(length):
+            out[at + 2 + i] = data[i]
+        return length

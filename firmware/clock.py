@@ -32,23 +32,20 @@ def ticks_diff(later, earlier):
 class FrameClock:
     """Tells when frames are due; measures how late they were begun.
 
-    `rate_hz` is the frame rate, 10..60. `late_max_us` and `late_frames` (begun a whole frame late or more) count since
-    `start`.
+    `rate_hz` is the frame rate, 10..60. `late_max_us` is how late a frame was begun at most since `start`.
     """
 
     def __init__(self):
         self.rate_hz = 30
         self.due_us = 0
         self.late_max_us = 0
-        self.late_frames = 0
         self._remainder = 0
 
-    def start(self, now_us, rate_hz):
-        """Make frame 0 due now."""
+    def start(self, due_us, rate_hz):
+        """Make frame 0 due at this instant, now or soon."""
         self.rate_hz = rate_hz
-        self.due_us = now_us
+        self.due_us = due_us
         self.late_max_us = 0
-        self.late_frames = 0
         self._remainder = 0
 
     def until_us(self, now_us):
@@ -62,8 +59,6 @@ class FrameClock:
             self.late_max_us = late_us
         rate_hz = self.rate_hz
         period_us = 1000000 // rate_hz
-        if late_us >= period_us:
-            self.late_frames += 1
         self._remainder += 1000000 % rate_hz
         if self._remainder >= rate_hz:
             self._remainder -= rate_hz

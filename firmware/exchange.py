@@ -2,7 +2,7 @@
 
 The host says for every new action, DOF and live channel which old one it was; what keeps its name keeps its state. What
 takes long is prepared a step at a time between frames, so that none is late: noise tables, repeated functions, the
-streams of blinks. Then, at the beginning of a frame, every state array is gathered by the list of old places.
+streams of blinks. Then, behind a frame, every state array is gathered by the list of old places.
 """
 
 import micropython
@@ -24,30 +24,30 @@ _NOT_KEPT = const(0xFFFF)
 
 
 @micropython.viper
-def gather_words(values: ptr32, old: ptr8, scratch: ptr32, count: int, fresh: int):
-    """Let `values[i]` be what `values[old[i]]` was, or `fresh` where `old[i]` is 255."""
+def gather_words(values: ptr32, old: ptr8, scratch: ptr32, count: int, fresh: int, at: int):
+    """Let `values[at + i]` be what `values[at + old[i]]` was, or `fresh` where `old[i]` is 255."""
     i = 0
     while i < count:
         k = int(old[i])
-        scratch[i] = fresh if k == _NEW else values[k]
+        scratch[i] = fresh if k == _NEW else values[at + k]
         i += 1
     i = 0
     while i < count:
-        values[i] = scratch[i]
+        values[at + i] = scratch[i]
         i += 1
 
 
 @micropython.viper
-def gather_halves(values: ptr16, old: ptr8, scratch: ptr32, count: int, fresh: int):
+def gather_halves(values: ptr16, old: ptr8, scratch: ptr32, count: int, fresh: int, at: int):
     """Do the same with 16-bit words."""
     i = 0
     while i < count:
         k = int(old[i])
-        scratch[i] = fresh if k == _NEW else int(values[k])
+        scratch[i] = fresh if k == _NEW else int(values[at + k])
         i += 1
     i = 0
     while i < count:
-        values[i] = scratch[i]
+        values[at + i] = scratch[i]
         i += 1
 
 
@@ -106,7 +106,7 @@ class Exchange:
         puppet.motor.load(puppet.tables)
 
     def carry_over(self):
-        """Put the prepared tables into force at the beginning of a frame; what keeps its name goes on."""
+        """Put the prepared tables into force between two frames; what keeps its name goes on."""
         puppet = self._puppet
         old = puppet.tables
         new = puppet.staged
@@ -115,30 +115,31 @@ class Exchange:
         keep = new.keep_action
         count = new.actions
         for values in (a.target_q28, a.x_q28, a.w_q28, a.before_q28, a.start_q18, a.fraction_q24):
-            gather_words(values, keep, scratch, count, 0)
-        gather_words(a.offset_q28, keep, scratch, count, WEIGHT_ONE)  # one cycle: no offset
-        gather_words(a.tempo_q16, keep, scratch, count, 0)
-        gather_words(a.wanted_tempo_q16, keep, scratch, count, 0)
+            gather_words(values, keep, scratch, count, 0, 0)
+        gather_words(a.offset_q28, keep, scratch, count, WEIGHT_ONE, 0)  # one cycle: no offset
+        gather_words(a.tempo_q16, keep, scratch, count, 0, 0)
+        gather_words(a.wanted_tempo_q16, keep, scratch, count, 0, 0)
         settle_tempos(keep, old.tempo_q16, new.tempo_q16, count, a.tempo_q16, a.wanted_tempo_q16)
-        gather_halves(a.cycle, keep, scratch, count, 0)
-        gather_halves(a.kept_cycle, keep, scratch, count, 0)
+        gather_halves(a.cycle, keep, scratch, count, 0, 0)
+        gather_halves(a.kept_cycle, keep, scratch, count, 0, 0)
         keep = new.keep_live
         for values in puppet.live_state:
-            gather_words(values, keep, scratch, new.lives, 0)
+            gather_words(values, keep, scratch, new.lives, 0, 0)
         for live in range(new.lives):
             if keep[live] == NEW:
                 for values in puppet.live_state:
                     values[live] = new.live_rest_q28[live]
         keep = new.keep_dof
         for values in puppet.hold_state:
-            gather_words(values, keep, scratch, new.dofs, WEIGHT_ONE)
+            gather_words(values, keep, scratch, new.dofs, WEIGHT_ONE, 0)
         for values in (puppet.base_q15, puppet.hold_q15):
-            gather_halves(values, keep, scratch, new.dofs, 0)
+            gather_halves(values, keep, scratch, new.dofs, 0, 0)
         for dof in range(new.dofs):
             if keep[dof] == NEW:
                 puppet.base_q15[dof] = puppet.hold_q15[dof] = new.rest_q15[dof]
         puppet.cues.renumber(new.keep_action, new.actions, new.keep_live, new.lives)
-        puppet.motor.exchange(new)
+        puppet.base_ring.rearrange(gather_halves, keep, scratch, new.dofs, puppet.frame, new.rest_q15)
+        puppet.motor.exchange(new, gather_words, gather_halves, scratch)
         self._swap()
 
     def _swap(self):

@@ -6,29 +6,69 @@ leaves the board safe: no pulses, nothing moving.
 
 import gc
 
+import micropython
+
+from firmware import store
+from firmware.clock import ticks_diff
 from firmware.link import Link
 from firmware.puppet import Puppet
+from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
+_CHUNKS = 4  # of bytes that are taken in one pass while no frame is due
+_WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board; a USB write may take 1100
 
 
-def perform(board):
-    """Run a puppet on a board. All that it needs is allocated before the loop begins."""
+def _pass(board, puppet, link):
+    """Take what has come, compute the frame if one is due, do what the motors need.
+
+    Returns how long there is nothing more to do, in microseconds, 0 or less for nothing of the kind; None if the host calls for
+    the REPL. Runs with the heap locked: nothing allocates while a puppet plays (`Link` unlocks it for tables). And
+    MicroPython then keeps the locals of larger functions on the stack, instead of looking through the heap for room, which costs
+    200 us a call once it is half full.
+    """
+    for _ in range(_CHUNKS):
+        if link.poll():
+            return None
+        if not link.is_behind or (puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0):
+            break
+    if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0:
+        puppet.step()
+        link.report()
+    puppet.motor.attend()
+    longest_us = min(_IDLE_US, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
+    if puppet.frame >= 0:
+        longest_us = min(longest_us, puppet.clock.until_us(board.ticks_us()))
+    return longest_us
+
+
+def perform(board, room=None):
+    """Run a puppet on a board. All that it needs is allocated before the loop begins.
+
+    `room` is a list with a buffer at the low end of the heap, which is freed then: what is allocated later, for a moment, is
+    found there without a search through all that stays.
+    """
     puppet = Puppet(board)
+    motor = puppet.motor
     link = Link(board, puppet)
-    gc.collect()
     try:
-        while not link.poll():
-            longest_us = _IDLE_US
-            if puppet.frame >= 0:
-                longest_us = puppet.clock.until_us(board.ticks_us())
-                if longest_us <= 0:
-                    puppet.step(link.silent)
-                    link.report()
-                    continue
-                if puppet.prepare():
-                    continue
-            board.wait(longest_us)
+        if room:
+            room.clear()
+        store.load(link.commands)
+        gc.collect()
+        if puppet.frame >= 0:
+            puppet.start()  # again, as reading and collecting have taken their time
+        board.watchdog(_WATCHDOG_MS)
+        longest_us = 0
+        while longest_us is not None:
+            if longest_us > 0 and not puppet.prepare():
+                board.wait(longest_us)
+            micropython.heap_lock()
+            try:
+                longest_us = _pass(board, puppet, link)
+            finally:
+                micropython.heap_unlock()
+            motor.maintain()
     finally:
-        puppet.motor.kill()
+        motor.kill(KILLED_BY_HOST)
         board.close()

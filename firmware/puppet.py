@@ -12,10 +12,12 @@ from firmware import clock, compositor, functions, weights
 from firmware.actions import Actions
 from firmware.blinks import Blinks
 from firmware.cues import Cues
+from firmware.drivers import Drivers
 from firmware.exchange import Exchange
 from firmware.motor import Motor
 from firmware.programs import Programs
 from firmware.tables import Tables, halves, words
+from firmware.trajectory import Ring
 from shared.formats import (
     DOFS_MAX,
     GRADIENTS,
@@ -26,7 +28,9 @@ from shared.formats import (
     WEIGHT_ONE,
 )
 
-_COLLECT_US = const(12000)  # what the heap's collection takes on an RP2040
+_COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
+_CARRY_US = const(16000)  # what putting other tables into force takes
+_MARGIN_US = const(3000)  # between the end of a frame and what is done then
 
 
 class Puppet:
@@ -42,14 +46,18 @@ class Puppet:
         self.frame_max_us = 0
         self.clock = clock.FrameClock()
         self.cues = Cues()
-        self.tables = Tables()  # those that play
-        self.staged = Tables()  # those that the host fills
-        self.motor = Motor(board, self.tables)
+        self.drivers = Drivers(board)
+        self.tables = Tables(self.drivers)  # those that play
+        self.staged = Tables(self.drivers)  # those that the host fills
+        self.motor = Motor(board, self.drivers, self.tables)
         self.tempo_q16 = words(1)
         self.actions = Actions()
         self.live_target_q28 = words(LIVES_MAX)
         self.base_q15 = halves(DOFS_MAX)
         self.signal_q15 = self.base_q15  # until a signal processing layer stands between them
+        self.base_ring = Ring()
+        self.base_ring_q15 = self.base_ring.value_q15
+        self.signal_ring_q15 = self.motor.trajectory.ring.value_q15
         self._board = board
         self._sine = functions.sine_table()
         self.gradients = halves(NOISE_TABLES * GRADIENTS)
@@ -72,7 +80,6 @@ class Puppet:
         self.hold_state = (self._hold_target_q28, self._hold_x_q28, self._hold_w_q28)
         self.exchange = Exchange(self)
         self._exchange_due = False
-        self._prepared_in = -1
         self._tempos_changed = 0
 
     def commit(self):
@@ -85,13 +92,12 @@ class Puppet:
             self._rest()
 
     def start(self):
-        """Begin the motion anew: frame 0 is due now. Targets that wait keep their stamps."""
+        """Begin the motion anew: frame 0 is due at a motor tick soon. Targets that wait keep their stamps."""
         self._rest()
         self.frame = 0
         self.frame_max_us = 0
         self.cues.counts[0] = 0
-        self.motor.begin()
-        self.clock.start(self._board.ticks_us(), self.tables.frame_rate_hz)
+        self.clock.start(self.motor.start(), self.tables.frame_rate_hz)
 
     def stop(self):
         """Stand still: no more frames, relative DOFs at 0, absolute DOFs where they are."""
@@ -104,32 +110,38 @@ class Puppet:
             self.commit()
 
     def prepare(self):
-        """Take a step of what an exchange of tables needs before the next frame; return whether there was one to take.
+        """Take a step of what an exchange of tables needs between frames; return whether there was one to take.
 
-        The last one collects what tables leave on the heap, so that it does not fill up in the middle of a frame. It waits
-        until there is time for that, but no longer than for the end of the next frame.
+        The last two collect what tables leave on the heap, so that it does not fill up in the middle of a frame, and put the
+        new tables into force. They wait until there is time for that.
         """
-        if self.exchange.step < 0 or self._exchange_due:
+        if self.exchange.step < 0:
             return False
-        if not self.exchange.prepare():
-            self._prepared_in = self.frame
-        elif self.frame == self._prepared_in and self.clock.until_us(self._board.ticks_us()) < _COLLECT_US:
-            return False
-        else:
+        if self._exchange_due:
+            if not self._has_time(_CARRY_US):
+                return False
+            self._exchange_due = False
+            self.exchange.carry_over()
+            self._tempos_changed = 1
+        elif self.exchange.prepare():
+            if not self._has_time(_COLLECT_US):
+                return False
             gc.collect()
             self._exchange_due = True
         return True
 
-    def step(self, silent):
-        """Compute the frame that is due and bring it to the motors; `silent` tells that the link is quiet."""
+    def _has_time(self, need_us):
+        """Return whether so much time is left until the next frame, or as much as there is behind any."""
+        most_us = 1000000 // self.clock.rate_hz - self.frame_max_us - _MARGIN_US
+        return self.clock.until_us(self._board.ticks_us()) >= min(need_us, most_us)
+
+    def step(self):
+        """Compute the frame that is due and hand it to the motors."""
         begun_us = self._board.ticks_us()
         self.clock.begin(begun_us)
-        if self._exchange_due:
-            self._exchange_due = False
-            self.exchange.carry_over()
-            self._tempos_changed = 1
         self._synthesise()
-        self.motor.move(self.signal_q15, silent)
+        self.base_ring.put(self.frame, self.tables.dofs, self.base_q15)
+        self.motor.put(self.frame, self.signal_q15)
         self.actions.warp(self.tables, self.tempo_q16[0], self.clock.rate_hz)
         clock.advance(self._master, self.tempo_q16[0], self.clock.rate_hz)
         self.frame += 1

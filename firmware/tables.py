@@ -11,11 +11,18 @@ from shared import program as isa
 from shared.formats import (
     ACTIONS_MAX,
     ALPHA_ONE,
+    ATTACH_MAX_MS,
     BLINKS_MAX,
     CURVES_MAX,
     CYCLES_MAX,
+    DEVICE_SETTINGS_MAX,
+    DEVICES_MAX,
     DOFS_MAX,
+    DRIVER_BRIDGE,
     ENTRY_START,
+    FEEDBACK_PIN_FIRST,
+    FEEDBACK_PIN_LAST,
+    FEEDBACK_SPAN_MIN_Q15,
     FRAME_RATE_MAX_HZ,
     FRAME_RATE_MIN_HZ,
     FUNCTION_BLINK,
@@ -28,16 +35,30 @@ from shared.formats import (
     KIND_RELATIVE,
     LIVES_MAX,
     MAPPINGS_MAX,
+    MOTOR_PERIOD_MAX_US,
+    MOTOR_PERIOD_MIN_US,
+    MOTOR_PERIOD_STEP_US,
     NEW,
+    NO_DRIVER,
     NO_PIN,
     NOISE_TABLES,
+    POSITION_BITS,
+    POSITION_ONE,
     PULSE_BITS,
+    PULSE_GAP_US,
     PULSE_MAX_US,
     PULSE_MIN_US,
+    PWM_PERIOD_MAX_US,
+    RESPONSE_MAX_Q24,
     SAMPLES_MAX,
     SAMPLES_POOL,
+    SETTINGS_MAX,
+    SILENT_RELAX,
+    STAND_MS,
     TEMPO_MAX_Q16,
     TEMPO_MIN_Q16,
+    TURNS_MAX,
+    VALUE_BITS,
     VALUE_ONE,
     WEIGHT_ONE,
 )
@@ -45,6 +66,9 @@ from shared.formats import (
 _GAP_MAX_Q18 = 1000 << 18
 _PULSE_MIN_Q4US = PULSE_MIN_US << PULSE_BITS
 _PULSE_MAX_Q4US = PULSE_MAX_US << PULSE_BITS
+_ACCEL_MIN_Q24 = 2
+_UNIT_TO_POSITION = POSITION_BITS - VALUE_BITS
+_RESPONSES = 6  # coefficients of a character
 
 
 def words(count):
@@ -57,35 +81,78 @@ def halves(count):
     return array("H", bytes(2 * count))
 
 
+def is_pin(pin):
+    """Return whether a Pico leaves this pin to us: the UART has the first two, and it uses 23 to 25 itself."""
+    return 2 <= pin <= 22 or 26 <= pin <= 28
+
+
+def _stand_accel_q24(period_us):
+    """Return the least acceleration, per tick, that brings full speed to a stand in STAND_MS, rounded up."""
+    return -(-(POSITION_ONE // 2) * period_us // (STAND_MS * 1000))
+
+
 class Tables:
     """One set of tables.
 
-    The methods `begin`, `dof` .. `live` store one message's fields and return None, or the number of the field that is out
-    of range. Order: `begin`, then `dof` 0, 1, .., `action` 0, 1, .., `mappings`, `live`, each
-    in its place exactly once.
+    The methods named like messages store one message's fields and return None, or the number of the field that is out
+    of range. Order: `begin`, then `robot`, `device`, `dof` 0, 1, .., what a DOF has (`character`, `output`, `feedback`,
+    `guard`), `action` 0, 1, .., `mappings`, `live`, each in its place exactly once.
+
+    `drivers` checks the settings of outputs and devices (`check_output`, `check_device`) and knows which pins they use
+    (`uses`); None leaves all that unchecked.
     """
 
-    def __init__(self):
+    def __init__(self, drivers=None):
+        self._drivers = drivers
         self.ready = False
         self.frame_rate_hz = 30
         self.dofs = self.actions = self.mappings = self.lives = self.curves = self.programs = self.blinks = 0
         self.seed = 0
         self.spread_q15 = 0
         self.link_timeout_ms = 500
+        self.when_silent = 0
+        # the robot
+        self.motor_period_us = MOTOR_PERIOD_MAX_US
+        self.attach_ms = 0
+        self.kill_pin = NO_PIN
+        self.kill_level = 0
+        self.autostart = False
+        self.device_driver = bytearray(DEVICES_MAX)
+        self.device_settings = halves(DEVICES_MAX * DEVICE_SETTINGS_MAX)
         # what each action, DOF and live channel was in the tables that play
         self.keep_action = bytearray(ACTIONS_MAX)
         self.keep_dof = bytearray(DOFS_MAX)
         self.keep_live = bytearray(LIVES_MAX)
-        self._forget_seen()
         # per DOF
         self.relative = bytearray(DOFS_MAX)
         self.rest_q15 = halves(DOFS_MAX)
         self.hold_q26 = words(DOFS_MAX)
-        self.limit_low_q15 = halves(DOFS_MAX)
-        self.limit_high_q15 = halves(DOFS_MAX)
-        self.pin = bytearray(DOFS_MAX)
-        self.pulse0_q4us = halves(DOFS_MAX)
-        self.pulse1_q4us = halves(DOFS_MAX)
+        self.limit_low_q24 = words(DOFS_MAX)
+        self.limit_high_q24 = words(DOFS_MAX)
+        self.speed_q24 = words(DOFS_MAX)
+        self.accel_q24 = words(DOFS_MAX)
+        self.has_character = bytearray(DOFS_MAX)
+        self.response_q24 = words(DOFS_MAX * _RESPONSES)
+        # per DOF: its output
+        self.driver = bytearray(DOFS_MAX)
+        self.turns = bytearray(DOFS_MAX)
+        self.end0_q4us = halves(DOFS_MAX)
+        self.end1_q4us = halves(DOFS_MAX)
+        self.dead_q15 = halves(DOFS_MAX)
+        self.top_q15 = halves(DOFS_MAX)
+        self.settings = halves(DOFS_MAX * SETTINGS_MAX)
+        # per DOF: its feedback and its guard
+        self.feedback_pin = bytearray(DOFS_MAX)
+        self.feedback_at0_q15 = halves(DOFS_MAX)
+        self.feedback_at1_q15 = halves(DOFS_MAX)
+        self.feedback_gain_q15 = halves(DOFS_MAX)
+        self.feedback_integral_q24 = words(DOFS_MAX)
+        self.feedback_most_q15 = halves(DOFS_MAX)
+        self.stall_q15 = halves(DOFS_MAX)
+        self.stall_ticks = halves(DOFS_MAX)
+        self.release_ms = halves(DOFS_MAX)
+        self.duty_q15 = halves(DOFS_MAX)
+        self.window_s = halves(DOFS_MAX)
         # per action
         self.tempo_q16 = words(ACTIONS_MAX)
         self.rise_q26 = words(ACTIONS_MAX)
@@ -115,11 +182,12 @@ class Tables:
         self.pool = words(isa.POOL_WORDS)
         self.threshold_q16 = words(BLINKS_MAX)
         self.gap_q18 = words(BLINKS_MAX)
+        self._forget_seen()
 
     # fmt: off
     def begin(
         self, frame_rate_hz, dofs, actions, mappings, lives, curves, programs, blinks, seed, spread_q15, hold_q26,
-        link_timeout_ms,
+        link_timeout_ms, when_silent,
     ):
         # fmt: on
         """Empty the set and announce what will come."""
@@ -138,6 +206,7 @@ class Tables:
                 (spread_q15, 0, VALUE_ONE),
                 (hold_q26, 1, ALPHA_ONE - 1),
                 (link_timeout_ms, 100, 60000),
+                (when_silent, 0, SILENT_RELAX),
             )
         ):
             if not least <= value <= most:
@@ -152,6 +221,7 @@ class Tables:
         for dof in range(DOFS_MAX):
             self.hold_q26[dof] = hold_q26
         self.link_timeout_ms = link_timeout_ms
+        self.when_silent = when_silent
         self.curves = curves
         self.programs = programs
         self.blinks = blinks
@@ -166,43 +236,236 @@ class Tables:
             for place in range(len(keep)):
                 keep[place] = NEW
         self._samples_used = self._samples_end = self._words_used = self._words_end = 0
+        self._robot_seen = False
+        self._stand_accel_q24 = _stand_accel_q24(MOTOR_PERIOD_MAX_US)
+        self._guarded = 0  # bit per DOF
+        for device in range(DEVICES_MAX):
+            self.device_driver[device] = NO_DRIVER
+        for dof in range(DOFS_MAX):
+            self._bare(dof)
 
-    def dof(self, dof, kind, rest_q15, low_q15, high_q15):
-        """Store a DOF; it drives nothing until `output` gives it a pin."""
-        if dof != self._dofs_seen or dof >= self.dofs:
+    def _bare(self, dof):
+        """Take away what a DOF may have: character, output, feedback, guard."""
+        self.has_character[dof] = 0
+        self.driver[dof] = NO_DRIVER
+        self.turns[dof] = 1
+        self.top_q15[dof] = VALUE_ONE
+        self.dead_q15[dof] = 0
+        self.feedback_pin[dof] = NO_PIN
+        self.release_ms[dof] = 0
+        self.duty_q15[dof] = VALUE_ONE
+        self.window_s[dof] = 0
+
+    def robot(self, motor_period_us, attach_ms, kill_pin, kill_level, autostart):
+        """Store what all outputs share: the motor layer's period, the pace of attaching, the pin that kills."""
+        if self._robot_seen or not MOTOR_PERIOD_MIN_US <= motor_period_us <= MOTOR_PERIOD_MAX_US:
+            return 0
+        if motor_period_us % MOTOR_PERIOD_STEP_US:
+            return 0
+        if attach_ms > ATTACH_MAX_MS:
+            return 1
+        if kill_pin != NO_PIN and not is_pin(kill_pin):
+            return 2
+        if kill_level > 1:
+            return 3
+        if autostart > 1:
+            return 4
+        self.motor_period_us = motor_period_us
+        self.attach_ms = attach_ms
+        self.kill_pin = kill_pin
+        self.kill_level = kill_level
+        self.autostart = bool(autostart)
+        self._stand_accel_q24 = _stand_accel_q24(motor_period_us)
+        self._robot_seen = True
+        return None
+
+    def device(self, device, driver, settings, count):
+        """Store a chip that outputs share: `count` settings from the beginning of `settings`, which are fields 2 and up."""
+        if not self._robot_seen or device >= DEVICES_MAX or self.device_driver[device] != NO_DRIVER:
+            return 0
+        if driver > DRIVER_BRIDGE:
+            return 1
+        if count > DEVICE_SETTINGS_MAX:
+            return 2 + DEVICE_SETTINGS_MAX
+        if self._drivers is not None:
+            bad = self._drivers.check_device(driver, settings, count)
+            if bad is None and self.kill_pin != NO_PIN:
+                bad = self._drivers.device_uses(driver, settings, self.kill_pin)
+            if bad is not None:
+                return 2 + bad
+        self.device_driver[device] = driver
+        for place in range(DEVICE_SETTINGS_MAX):
+            self.device_settings[device * DEVICE_SETTINGS_MAX + place] = settings[place] if place < count else 0
+        return None
+
+    def dof(self, dof, kind, rest_q15, low_q15, high_q15, speed_q24, accel_q24):
+        """Store a DOF; it drives nothing until `output` gives it a driver."""
+        if not self._robot_seen or dof != self._dofs_seen or dof >= self.dofs:
             return 0
         if kind > KIND_RELATIVE:
             return 1
-        if high_q15 > VALUE_ONE:
-            return 4
-        if low_q15 > high_q15:
-            return 3
         if rest_q15 > VALUE_ONE:
             return 2
+        bad = self._bad_limit(kind, low_q15, high_q15, speed_q24, accel_q24)
+        if bad is not None:
+            return 3 + bad
         self.relative[dof] = kind
         self.rest_q15[dof] = VALUE_ONE // 2 if kind == KIND_RELATIVE else rest_q15
-        self.limit_low_q15[dof] = low_q15
-        self.limit_high_q15[dof] = high_q15
-        self.pin[dof] = NO_PIN
+        self.limit(dof, low_q15, high_q15, speed_q24, accel_q24)
         self._dofs_seen += 1
         return None
 
-    def output(self, dof, pin, pulse0_q4us, pulse1_q4us, board):
-        """Give a stored DOF its pin and the pulse widths at value 0 and at value 1 (either may be the larger)."""
+    def limit(self, dof, low_q15, high_q15, speed_q24, accel_q24):
+        """Set the range, top speed and top acceleration of a DOF, which have been checked."""
+        self.limit_low_q24[dof] = low_q15 << _UNIT_TO_POSITION
+        self.limit_high_q24[dof] = high_q15 << _UNIT_TO_POSITION
+        self.speed_q24[dof] = speed_q24
+        self.accel_q24[dof] = accel_q24
+
+    def bad_limit(self, dof, low_q15, high_q15, speed_q24, accel_q24):
+        """Return the number of the bad field of new limits for a DOF, or None; stores nothing. Allocates nothing."""
         if dof >= self._dofs_seen:
             return 0
-        if not board.is_output(pin):
+        bad = self._bad_limit(self.relative[dof], low_q15, high_q15, speed_q24, accel_q24)
+        return None if bad is None else 1 + bad
+
+    def _bad_limit(self, kind, low_q15, high_q15, speed_q24, accel_q24):
+        if high_q15 > VALUE_ONE:
+            return 1
+        if low_q15 > high_q15:
+            return 0
+        if kind == KIND_RELATIVE:
+            if low_q15 > VALUE_ONE // 2:  # it could not stand
+                return 0
+            if high_q15 < VALUE_ONE // 2:
+                return 1
+        if not 1 <= speed_q24 <= POSITION_ONE:
+            return 2
+        least = self._stand_accel_q24 if kind == KIND_RELATIVE else _ACCEL_MIN_Q24
+        if not least <= accel_q24 <= POSITION_ONE:
+            return 3
+        return None
+
+    # fmt: off
+    def character(
+        self, dof, position_error_q24, position_rate_q24, position_slope_q24, rate_error_q24, rate_rate_q24,
+        rate_slope_q24,
+    ):
+        # fmt: on
+        """Give a stored DOF its second-order dynamics: six coefficients of `response_q24`, in this order."""
+        if dof >= self._dofs_seen or self.has_character[dof]:
+            return 0
+        responses = (
+            position_error_q24, position_rate_q24, position_slope_q24, rate_error_q24, rate_rate_q24, rate_slope_q24
+        )
+        for number, response_q24 in enumerate(responses):
+            if not -RESPONSE_MAX_Q24 <= response_q24 <= RESPONSE_MAX_Q24:
+                return 1 + number
+            self.response_q24[dof * _RESPONSES + number] = response_q24
+        self.has_character[dof] = 1
+        return None
+
+    def output(self, dof, driver, turns, end0_q4us, end1_q4us, dead_q15, top_q15, settings, count):
+        """Give a stored DOF its output: `count` settings from the beginning of `settings`, which are fields 7 and up.
+
+        The ends are the pulse widths at value 0 and at value 1 (either may be the larger), both 0 for a bridge.
+        """
+        if dof >= self._dofs_seen or self.driver[dof] != NO_DRIVER:
+            return 0
+        if driver > DRIVER_BRIDGE:
+            return 1
+        if not 1 <= turns <= TURNS_MAX or turns * self.motor_period_us > PWM_PERIOD_MAX_US:
+            return 2
+        bad = self._bad_calibration(driver, turns, end0_q4us, end1_q4us, dead_q15, top_q15)
+        if bad is not None:
+            return 3 + bad
+        if count > SETTINGS_MAX:
+            return 7 + SETTINGS_MAX
+        self.turns[dof] = turns
+        if self._drivers is not None:
+            bad = self._drivers.check_output(driver, self, dof, settings, count)
+            if bad is not None:
+                return 7 + bad
+        self.driver[dof] = driver
+        for place in range(SETTINGS_MAX):
+            self.settings[dof * SETTINGS_MAX + place] = settings[place] if place < count else 0
+        self.calibrate(dof, end0_q4us, end1_q4us, dead_q15, top_q15)
+        return None
+
+    def calibrate(self, dof, end0_q4us, end1_q4us, dead_q15, top_q15):
+        """Set the ends, dead band and top of a DOF's output, which have been checked."""
+        self.end0_q4us[dof] = end0_q4us
+        self.end1_q4us[dof] = end1_q4us
+        self.dead_q15[dof] = dead_q15
+        self.top_q15[dof] = top_q15
+
+    def bad_calibration(self, dof, end0_q4us, end1_q4us, dead_q15, top_q15):
+        """Return the number of the bad field of a new calibration for a DOF, or None; stores nothing. Allocates nothing."""
+        if dof >= self._dofs_seen or self.driver[dof] == NO_DRIVER:
+            return 0
+        bad = self._bad_calibration(self.driver[dof], self.turns[dof], end0_q4us, end1_q4us, dead_q15, top_q15)
+        return None if bad is None else 1 + bad
+
+    def _bad_calibration(self, driver, turns, end0_q4us, end1_q4us, dead_q15, top_q15):
+        least = most = 0
+        if driver != DRIVER_BRIDGE:
+            least = _PULSE_MIN_Q4US
+            most = min(_PULSE_MAX_Q4US, (turns * self.motor_period_us - PULSE_GAP_US) << PULSE_BITS)
+        if not least <= end0_q4us <= most:
+            return 0
+        if not least <= end1_q4us <= most:
+            return 1
+        if top_q15 > VALUE_ONE:
+            return 3
+        if dead_q15 >= top_q15:
+            return 2
+        return None
+
+    def feedback(self, dof, pin, at0_q15, at1_q15, gain_q15, integral_q24, most_q15, stall_q15, stall_ticks):
+        """Give a stored absolute DOF its feedback input: the ratios measured at value 0 and at value 1, and its correction."""
+        if dof >= self._dofs_seen or self.relative[dof] or self.feedback_pin[dof] != NO_PIN:
+            return 0
+        if not FEEDBACK_PIN_FIRST <= pin <= FEEDBACK_PIN_LAST or pin == self.kill_pin:
+            return 1
+        if self._drivers is not None and self._drivers.uses(self, pin):
             return 1
         for other in range(self._dofs_seen):
-            if other != dof and self.pin[other] != NO_PIN and board.clash(pin, self.pin[other]):
+            if self.feedback_pin[other] == pin:
                 return 1
-        if not _PULSE_MIN_Q4US <= pulse0_q4us <= _PULSE_MAX_Q4US:
+        if at0_q15 > VALUE_ONE:
             return 2
-        if not _PULSE_MIN_Q4US <= pulse1_q4us <= _PULSE_MAX_Q4US:
+        if at1_q15 > VALUE_ONE or abs(at1_q15 - at0_q15) < FEEDBACK_SPAN_MIN_Q15:
             return 3
-        self.pin[dof] = pin
-        self.pulse0_q4us[dof] = pulse0_q4us
-        self.pulse1_q4us[dof] = pulse1_q4us
+        for number, value, most in (
+            (4, gain_q15, VALUE_ONE),
+            (5, integral_q24, POSITION_ONE),
+            (6, most_q15, VALUE_ONE),
+            (7, stall_q15, VALUE_ONE),
+        ):
+            if value > most:
+                return number
+        self.feedback_pin[dof] = pin
+        self.feedback_at0_q15[dof] = at0_q15
+        self.feedback_at1_q15[dof] = at1_q15
+        self.feedback_gain_q15[dof] = gain_q15
+        self.feedback_integral_q24[dof] = integral_q24
+        self.feedback_most_q15[dof] = most_q15
+        self.stall_q15[dof] = stall_q15
+        self.stall_ticks[dof] = stall_ticks
+        return None
+
+    def guard(self, dof, release_ms, duty_q15, window_s):
+        """Give a stored DOF its guard: when it is let go for standing still, and how much of a window it may move."""
+        if dof >= self._dofs_seen or self._guarded & 1 << dof:
+            return 0
+        if not 1 <= duty_q15 <= VALUE_ONE:
+            return 2
+        if duty_q15 < VALUE_ONE and window_s == 0:
+            return 3
+        self.release_ms[dof] = release_ms
+        self.duty_q15[dof] = duty_q15
+        self.window_s[dof] = window_s
+        self._guarded |= 1 << dof
         return None
 
     def action(self, action, tempo_q16, rise_q26, fall_q26, first_mapping, mappings, entry, warp_q26, cycles):
@@ -384,7 +647,8 @@ class Tables:
     def missing(self):
         """Return how many of the announced parts have not come."""
         return (
-            (self.dofs - self._dofs_seen)
+            (0 if self._robot_seen else 1)
+            + (self.dofs - self._dofs_seen)
             + (self.actions - self._actions_seen)
             + (self.mappings - self._mappings_seen)
             + (self.lives - self._lives_seen)

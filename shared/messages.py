@@ -10,7 +10,7 @@ PROTOCOL counts changes of meaning; the checksum of this dictionary catches chan
 exchanged by `hello` and `welcome`, whose layout, with that of `ack`, never changes.
 """
 
-PROTOCOL = 1
+PROTOCOL = 2
 
 HELLO = 0x10
 PING = 0x11
@@ -34,11 +34,24 @@ ARM = 0x28
 KILL = 0x29
 TELEMETRY = 0x2A
 STATUS_REQUEST = 0x2B
+ROBOT = 0x2C
+DEVICE = 0x2D
+CHARACTER = 0x2E
+FEEDBACK = 0x2F
+GUARD = 0x30
+CALIBRATE = 0x31
+LIMIT = 0x32
+SAVE_BEGIN = 0x33
+SAVE = 0x34
+SAVE_END = 0x35
+SAVE_ERASE = 0x36
 WELCOME = 0x80
 ACK = 0x81
 TAPS = 0x82
 WEIGHTS = 0x83
 STATUS = 0x84
+DERIVATIVES = 0x85
+MOTOR_STATUS = 0x86
 
 MESSAGES = (
     # --- to the MCU: the session
@@ -61,11 +74,82 @@ MESSAGES = (
             ("noise_spread_q15", "H"),
             ("hold_q26", "I"),
             ("link_timeout_ms", "H"),
+            ("when_silent", "B"),
         ),
         (),
     ),
-    ("dof", DOF, (("dof", "B"), ("kind", "B"), ("rest_q15", "H"), ("low_q15", "H"), ("high_q15", "H")), ()),
-    ("output", OUTPUT, (("dof", "B"), ("pin", "B"), ("pulse0_q4us", "H"), ("pulse1_q4us", "H")), ()),
+    (
+        "robot",
+        ROBOT,
+        (
+            ("motor_period_us", "H"),
+            ("attach_ms", "H"),
+            ("kill_pin", "B"),
+            ("kill_level", "B"),
+            ("autostart", "B"),
+        ),
+        (),
+    ),
+    ("device", DEVICE, (("device", "B"), ("driver", "B")), (("setting", "H"),)),
+    (
+        "dof",
+        DOF,
+        (
+            ("dof", "B"),
+            ("kind", "B"),
+            ("rest_q15", "H"),
+            ("low_q15", "H"),
+            ("high_q15", "H"),
+            ("speed_q24", "I"),
+            ("accel_q24", "I"),
+        ),
+        (),
+    ),
+    (
+        "character",
+        CHARACTER,
+        (
+            ("dof", "B"),
+            ("position_error_q24", "i"),
+            ("position_rate_q24", "i"),
+            ("position_slope_q24", "i"),
+            ("rate_error_q24", "i"),
+            ("rate_rate_q24", "i"),
+            ("rate_slope_q24", "i"),
+        ),
+        (),
+    ),
+    (
+        "output",
+        OUTPUT,
+        (
+            ("dof", "B"),
+            ("driver", "B"),
+            ("turns", "B"),
+            ("end0_q4us", "H"),
+            ("end1_q4us", "H"),
+            ("dead_q15", "H"),
+            ("top_q15", "H"),
+        ),
+        (("setting", "H"),),
+    ),
+    (
+        "feedback",
+        FEEDBACK,
+        (
+            ("dof", "B"),
+            ("pin", "B"),
+            ("at0_q15", "H"),
+            ("at1_q15", "H"),
+            ("gain_q15", "H"),
+            ("integral_q24", "I"),
+            ("most_q15", "H"),
+            ("stall_q15", "H"),
+            ("stall_ticks", "H"),
+        ),
+        (),
+    ),
+    ("guard", GUARD, (("dof", "B"), ("release_ms", "H"), ("duty_q15", "H"), ("window_s", "H")), ()),
     (
         "action",
         ACTION,
@@ -104,6 +188,24 @@ MESSAGES = (
     ("kill", KILL, (), ()),
     ("telemetry", TELEMETRY, (("taps", "B"), ("taps_every", "H"), ("weights_every", "H")), ()),
     ("status_request", STATUS_REQUEST, (), ()),
+    # --- to the MCU: the tables that play
+    (
+        "calibrate",
+        CALIBRATE,
+        (("dof", "B"), ("end0_q4us", "H"), ("end1_q4us", "H"), ("dead_q15", "H"), ("top_q15", "H")),
+        (),
+    ),
+    (
+        "limit",
+        LIMIT,
+        (("dof", "B"), ("low_q15", "H"), ("high_q15", "H"), ("speed_q24", "I"), ("accel_q24", "I")),
+        (),
+    ),
+    # --- to the MCU: what it keeps on its flash
+    ("save_begin", SAVE_BEGIN, (("bytes", "I"), ("crc32", "I")), ()),
+    ("save", SAVE, (("place", "I"),), (("byte", "B"),)),
+    ("save_end", SAVE_END, (), ()),
+    ("save_erase", SAVE_ERASE, (), ()),
     # --- from the MCU
     (
         "welcome",
@@ -141,6 +243,26 @@ MESSAGES = (
         ),
         (),
     ),
+    ("derivatives", DERIVATIVES, (("frame", "i"),), (("slope_q16", "i"), ("bend_q15", "i"))),
+    (
+        "motor_status",
+        MOTOR_STATUS,
+        (
+            ("ticks", "I"),
+            ("late_frames", "I"),
+            ("tick_max_us", "H"),
+            ("tick_late_max_us", "H"),
+            ("attached", "H"),
+            ("released", "H"),
+            ("stalled", "H"),
+            ("killed_by", "B"),
+            ("bus_errors", "I"),
+            ("bus_gone", "B"),
+            ("resets", "B"),
+            ("store", "B"),
+        ),
+        (),
+    ),
 )
 
 # Status of an acknowledgement; `detail` says which index, count or number was meant.
@@ -150,9 +272,10 @@ MISMATCH = 2  # hello: protocol or dictionary differ; the welcome that follows t
 UNKNOWN = 3  # no such message; detail: its id
 LENGTH = 4  # the payload has not the length of its message; detail: the length found
 RANGE = 5  # a field is out of its range; detail: which field, counted from 0 (items go on after the fields)
-INCOMPLETE = 6  # commit without all that begin announced; detail: how many parts are missing
-STATE = 7  # not possible now (tables while the motion runs, start without tables, arm without outputs)
+INCOMPLETE = 6  # commit or save_end without all that was announced; detail: how many parts or bytes are missing
+STATE = 7  # not possible now (start without tables, arm without outputs, save while armed or while the motion runs)
 FULL = 8  # the queue of stamped targets is full; detail: its free places
+FLASH = 9  # the flash could not be read or written; detail: the number of the error, as in errno
 
 STATUS_TEXT = (
     "done",
@@ -164,6 +287,7 @@ STATUS_TEXT = (
     "tables are incomplete",
     "not possible in this state",
     "the queue of stamped targets is full",
+    "the flash could not be read or written",
 )
 
 _SIZES = {"B": 1, "H": 2, "I": 4, "i": 4}

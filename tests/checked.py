@@ -71,7 +71,9 @@ class _Loader:
         self._root = root
         self._options = limit_bits, bytecode, patterns
         self._files = {}
-        micropython = types.SimpleNamespace(viper=_unchanged, native=_unchanged, const=_unchanged)
+        micropython = types.SimpleNamespace(
+            viper=_unchanged, native=_unchanged, const=_unchanged, heap_lock=_nothing, heap_unlock=_nothing
+        )
         self._modules = {"micropython": micropython, **overrides}
 
     def load(self, path):
@@ -232,6 +234,10 @@ class _Instrumenter(ast.NodeTransformer):
         name = f"__check_{len(self.places)}__"
         self.helpers[name] = getattr(place, method)
         return ast.copy_location(ast.Call(ast.Name(name, ast.Load()), [node], []), node)
+
+
+def _nothing():
+    """Stand in for what has no meaning here: CPython's heap cannot be locked."""
 
 
 def _unchanged(given):

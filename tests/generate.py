@@ -2,7 +2,8 @@
 
 Levels: `"core"` has absolute and relative DOFs, `rsin rcos noise1..16 const live`, masks, weights,
 behaviours, live channels and the global tempo; `"full"` adds expressions, tables, blinks, gestures,
-entries, warps, moods, gains and tempo cues of single actions.
+entries, warps, moods, gains and tempo cues of single actions. What belongs to the motor layer, and robots, are drawn
+apart, as the motion does not depend on them.
 
 All numbers are short decimals, so a text read back by `tomllib` is the dict again.
 """
@@ -15,6 +16,8 @@ from tests.generate_expressions import random_expression
 _MAPPINGS_LIMIT = 512
 _CHANNELS = ("GAZE_YAW", "GAZE_PITCH", "SPEED", "TURN")
 _NOISES = tuple(f"noise{k}" for k in range(1, 17))
+_CHANNEL_PAIRS = tuple(((2 * k, 2 * k + 1), (2 * k + 16, 2 * k + 17)) for k in range(8))
+_OUTPUT_PINS = {*range(2, 23), *range(26, 29)}
 
 
 def random_puppet(rng, level="core", dofs=None, actions=None, gains=True):
@@ -68,6 +71,51 @@ def random_score(rng, puppet, seconds, level="core", gains=True):
     if rng.random() < 0.8:
         cues.sort(key=lambda cue: cue["at"])
     return {"cue": cues}
+
+
+def add_random_dynamics(rng, puppet):
+    """Give the DOFs of a puppet limits and characters, or none; where they rest is within their limits."""
+    for dof in puppet["dof"].values():
+        relative = dof.get("kind") == "relative"
+        if rng.random() < 0.6:
+            dof["limits"] = _random_limits(rng, relative, 0 if relative else dof.get("rest", 0.5))
+        if rng.random() < 0.5:
+            dof["character"] = _random_character(rng)
+
+
+def random_robot(rng, puppet):
+    """Return a robot for most DOFs of a puppet: servos and bridges at pins, each with a calibration, limits and a rate.
+
+    Nothing in it depends on how quickly the MCU computes: no DOF is let go while it plays.
+    """
+    robot = {
+        "name": "random",
+        "rate": rng.choice((50, 333, 100, _decimal(rng, 50, 333))),
+        "attach_interval": rng.choice((0, 0.02, 0.05)),
+    }
+    pairs = []
+    for pins in _CHANNEL_PAIRS:
+        known = [rng.choice([pin for pin in channel if pin in _OUTPUT_PINS]) for channel in zip(*pins, strict=True)]
+        pairs.append(known)
+    rng.shuffle(pairs)
+    wheels = [name for name, dof in puppet["dof"].items() if dof.get("kind") == "relative"]
+    bridged = [name for name in wheels[:3] if rng.random() < 0.3]
+    outputs = {name: _random_bridge(rng, pairs.pop()) for name in bridged}
+    # Outputs of one slice have one rate.
+    rates_hz = [rng.choice((None, None, 50, 100, _decimal(rng, 50, 333))) for _ in pairs]
+    free = [(pin, rate_hz) for pair, rate_hz in zip(pairs, rates_hz, strict=True) for pin in pair]
+    rng.shuffle(free)
+    for name in puppet["dof"]:
+        if name not in outputs and free and rng.random() < 0.9:
+            outputs[name] = _random_servo(rng, *free.pop())
+    for name, output in outputs.items():
+        dof = puppet["dof"][name]
+        relative = dof.get("kind") == "relative"
+        if rng.random() < 0.4:
+            output |= _random_limits(rng, relative, 0 if relative else dof.get("rest", 0.5), table=True)
+        if relative and rng.random() < 0.5:
+            output["dead_band"], output["top_speed"] = _decimal(rng, 0, 0.5), _decimal(rng, 0.6, 1)
+    return robot | {"output": {name: outputs[name] for name in puppet["dof"] if name in outputs}}
 
 
 def random_target(rng):
@@ -130,6 +178,49 @@ def _random_dof(rng):
     if rng.random() < 0.5:
         dof["rest"] = rng.choice((0, 1, _decimal(rng, 0, 1)))
     return dof
+
+
+def _random_limits(rng, relative, rest, table=False):
+    """Return limits as a list or a table; `rest` lies within."""
+    least = -1 if relative else 0
+    bounds = [round(rng.uniform(least, rest), 3), round(rng.uniform(rest, 1), 3)]
+    if bounds[0] >= bounds[1]:
+        bounds = [least, 1]
+    if not table and rng.random() < 0.4:
+        return bounds
+    limits = {"range": bounds} if rng.random() < 0.7 else {}
+    if rng.random() < 0.7:
+        limits["accel"] = _logarithmic(rng, 4 if relative else 1, 1000)
+    if not relative and rng.random() < 0.7:
+        limits["speed"] = _logarithmic(rng, 0.05, 50)
+    return limits if limits or table else bounds
+
+
+def _random_character(rng):
+    character = {"f": rng.choice((0.2, 10, _logarithmic(rng, 0.2, 10)))}
+    if rng.random() < 0.8:
+        character["zeta"] = rng.choice((0.1, 1, 3, _logarithmic(rng, 0.1, 3)))
+    if rng.random() < 0.7:
+        character["r"] = rng.choice((-4, 4, _decimal(rng, -4, 4)))
+    return character
+
+
+def _random_servo(rng, pin, rate_hz):
+    low_us, high_us = rng.choice(((1000, 2000), (600.5, 2500), sorted(rng.uniform(600, 2500) for _ in range(2))))
+    servo = {
+        "pin": pin,
+        "pulse_us": [round(low_us, 3), round(high_us, 3)],
+        "trim_us": round(rng.uniform(-300, 300), 2),
+        "invert": rng.random() < 0.4,
+    }
+    return servo | ({"rate": rate_hz} if rate_hz else {})
+
+
+def _random_bridge(rng, pins):
+    """Return a bridge at both channels of a PWM slice."""
+    one, other = pins
+    keys = rng.choice(({"pwm": one, "direction": other}, {"wiring": "two-pwm", "forward": one, "backward": other}))
+    return {"driver": "bridge", "invert": rng.random() < 0.4} | keys
 
 
 def _random_live(rng):

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """What a frame costs: the firmware's layers timed one by one on the emulated RP2040, with the image that is flashed.
 
-The stage has 10 DOFs and 30 actions with 6 mappings each, of which 6 actions play. Times are read from the chip's own
+The stage has 10 DOFs and 30 actions with 6 mappings each, of which 6 actions play. Motor ticks do not run while layers are
+timed; they are measured in performances of their own. Times are read from the chip's own
 timer (whole microseconds) around every call, less those of a call with the same arguments that does nothing. What the whole
 frame costs beyond its layers is MicroPython collecting their arguments. The emulator counts the cycles of every
 instruction, but knows no flash cache: on a real Pico its misses come on top, most of all for code that runs seldom.
@@ -13,6 +14,7 @@ import statistics
 import tempfile
 from pathlib import Path
 
+from bench_motor import measure_ticks, percentile
 from bench_parts import measure_exchange, measure_functions
 from bench_stage import ACTIONS, DOFS, FRAMES, MAPPINGS, PATIENCE_US, PLAYING, SETUP, Cost, Stage, numbers, play
 
@@ -38,8 +40,7 @@ LAYERS = {
     "functions": ("functions", "evaluate"),
     "repeated functions": ("functions", "repeat"),
     "compositor": ("compositor", "blend"),
-    "motor": ("puppet.motor", "move"),
-    "  PWM in it": ("board", "pulses"),
+    "to the motor layer": ("puppet.motor", "put"),
     "warping": ("actions", "_warp"),
     "master phase": ("clock", "advance"),
 }
@@ -51,7 +52,7 @@ def frames(call):
     gc.collect()
     for _ in range({frames}):
         begun = time.ticks_us()
-        call(False)
+        call()
         times.append(time.ticks_diff(time.ticks_us(), begun))
     return times
 def nothing(*_):
@@ -91,7 +92,7 @@ class Layer:
         self.seen.clear()
 layers = [Layer(place, name) for place, name in ({layers})]
 for _ in range({frames}):
-    puppet.step(False)
+    puppet.step()
     gc.collect()
     for layer in layers:
         layer.measure()
@@ -102,10 +103,15 @@ for layer in layers:
 MEASURE_TELEMETRY = """
 from firmware.link import Link
 link = Link(board, puppet)
-link.silent = False
-link._taps, link._taps_every, link._weights_every = 7, 1, 1
+puppet.motor.heard()
+link.telemetry.ask(7, 1, 1)
 board.send = empty_for((0, 0))
-print(frames(lambda _: link.report()))
+def report():
+    puppet.motor.heard()
+    puppet.motor.tapped[0] = puppet.frame - 1
+    link.report()
+    puppet.frame += 1
+print(frames(report))
 """
 
 RECEIVE = """
@@ -199,6 +205,15 @@ def main() -> None:
         print(f"\n{title:32}{'median us':>10}{'max us':>10}")
         for cost in some:
             print(f"{cost.name:32}{cost.median_us:10.1f}{cost.greatest_us:10.1f}")
+    ticks = measure_ticks(image.path)
+    print(
+        f"\n{'motor ticks, link saturated':32}{'p50 us':>10}{'p99 us':>10}{'max us':>10}{'late p50':>10}{'p99':>6}{'max':>6}"
+    )
+    for kind in ticks:
+        took = "".join(f"{percentile(kind.took_us, share):10d}" for share in (0.5, 0.99, 1))
+        late = "".join(f"{percentile(kind.late_us, share):{width}d}" for share, width in ((0.5, 10), (0.99, 6), (1, 6)))
+        print(f"{kind.name:32}{took}{late}")
+        print(f"{'  frames late, longest frame':32}{kind.status['late_frames']:10d}{kind.status['frame_max_us']:10d}")
     print(f"\nin a performance with all telemetry every frame, {PERFORMANCE_FRAMES} frames")
     print(f"{'the whole frame':32}{'':10}{told['frame_max_us']:10.1f}")
     print(f"{'a frame begun late':32}{'':10}{told['late_max_us']:10.1f}")

@@ -6,7 +6,9 @@ import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from marotte.character import response
 from marotte.mcu.raw_repl import RawRepl
+from marotte.puppet import Character
 from shared import formats, messages, program
 
 DOFS = 10
@@ -16,6 +18,12 @@ MAPPINGS = 6
 FRAMES = 100
 RATE_HZ = 30
 LINES_AT_ONCE = 40
+SPEED = 10.0
+ACCEL = 200.0
+"""Limits per second and per second squared."""
+
+CHARACTER = Character(f_hz=3.0, zeta=0.5, r=0.5)
+
 PATIENCE_US = 30_000_000
 
 FUNCTIONS = (
@@ -34,7 +42,7 @@ _ARGUMENTS = {formats.FUNCTION_NOISE: formats.NOISE_TABLES}
 
 
 SETUP = """
-import gc, micropython, time
+import array, gc, micropython, time
 from firmware import actions, clock, compositor, functions, weights
 from firmware.board_rp2040 import Board
 from firmware.puppet import Puppet
@@ -47,12 +55,12 @@ PLAY = """
 puppet.stop()
 puppet.commit()
 staged = puppet.staged
-puppet.motor.arm()
 puppet.start()
+board.stop_ticks()
 for action in range({playing}):
     puppet.actions.target_q28[action] = (1 << 28) - 1000 * action
 for _ in range(60):
-    puppet.step(False)
+    puppet.step()
 """
 
 
@@ -81,6 +89,8 @@ class Stage:
     actions: int
     functions: Sequence[tuple[int, int | None]] = FUNCTIONS
     words: Sequence[int] = (program.CONST, 0)
+    motor_period_us: int = formats.MOTOR_PERIOD_MAX_US
+    has_characters: bool = False
 
     def messages(self) -> Iterator[tuple[str, dict[str, int], list[dict[str, int]]]]:
         """Yield the upload's messages in their order."""
@@ -91,12 +101,22 @@ class Stage:
         blinks = MAPPINGS if kinds & {formats.FUNCTION_BLINK, formats.FUNCTION_RTRIGSIN} else 0
         # fmt: off
         yield _message(
-            "begin", RATE_HZ, DOFS, self.actions, self.actions * MAPPINGS, 1, curves, programs, blinks, 1999, 0, alpha_q26, 500
+            "begin", RATE_HZ, DOFS, self.actions, self.actions * MAPPINGS, 1, curves, programs, blinks, 1999, 0, alpha_q26, 500,
+            formats.SILENT_IDLE,
         )
         # fmt: on
+        yield _message("robot", self.motor_period_us, 0, formats.NO_PIN, 0, 0)
+        tick_s = self.motor_period_us * 1e-6
+        speed_q24 = int(SPEED * tick_s * formats.POSITION_ONE)
+        accel_q24 = int(ACCEL * tick_s**2 * formats.POSITION_ONE)
         for dof in range(DOFS):
-            yield _message("dof", dof, formats.KIND_ABSOLUTE, formats.VALUE_ONE // 2, 0, formats.VALUE_ONE)
-            yield _message("output", dof, 2 + dof, 16000, 32000)
+            limits = (0, formats.VALUE_ONE, speed_q24, accel_q24)
+            yield _message("dof", dof, formats.KIND_ABSOLUTE, formats.VALUE_ONE // 2, *limits)
+        for dof in range(DOFS):
+            if self.has_characters:
+                yield "character", {"dof": dof, **response(CHARACTER, tick_s).fixed()}, []
+            output = _message("output", dof, formats.DRIVER_PINS, 1, 16000, 32000, 0, formats.VALUE_ONE)
+            yield output[0], output[1], [{"setting": 2 + dof}]
         for action in range(self.actions):
             tempo_q16 = 50000 + 7 * action
             entry = (formats.ENTRY_START, alpha_q26, 0)
@@ -139,7 +159,11 @@ def _lines(stage: Stage) -> Iterator[str]:
             for number, item in enumerate(items):
                 yield f"assert staged.mapping({fields['first_mapping'] + number}, *{tuple(item.values())}) is None"
         elif name != "commit":
-            yield f"assert staged.{name}({values}{', board' if name == 'output' else ''}) is None"
+            if name == "output":
+                settings = [item["setting"] for item in items]
+                yield f"assert staged.output({values}, array.array('H', {settings}), {len(settings)}) is None"
+                continue
+            yield f"assert staged.{name}({values}) is None"
             method = {"curve": "sample", "program": "word"}.get(name)
             for item in items:
                 yield f"assert staged.{method}({', '.join(map(str, item.values()))}) is None"

@@ -2,15 +2,17 @@
 
 The faults are listed in `tools/mutants.toml`. They are planted in a copy of the tree, never in the checkout. First the
 tests run as they are and must pass; then each fault must make its test fail. NAMEs choose faults by parts of their names.
-Ends with status 1 if a fault survives, if its text is not found exactly once, or if a test fails without one.
+Ends with status 1 if a fault survives, if its text is not found exactly once, or if a test fails without one. Where the
+RP2040's image cannot be built, the faults that only it shows are left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import shutil
-import subprocess
+import signal
 import sys
 import tempfile
 import time
@@ -27,21 +29,30 @@ WORKERS = 2
 PATIENCE_S = 120
 """A fault may hang its test; that is found, too."""
 
+PATIENCE_WITHOUT_S = 600
+"""For all tests without a fault."""
+
 COMPLAINT_LENGTH = 100
 
 PASSED, FAILED = 0, 1
 """Exit statuses of pytest; any other says that the test did not run."""
 
 
+PROCESSES = multiprocessing.get_context("forkserver")
+PROCESSES.set_forkserver_preload(["hypothesis.strategies", "numpy", "pytest", "rich.live", "serial"])
+"""Each test runs in a process of its own, which finds loaded what has no faults: it takes longer to load than most tests do."""
+
+
 @dataclass(frozen=True)
 class Mutant:
-    """A fault: `old` in `file` becomes `new`, and `test`, a pytest node, fails."""
+    """A fault: `old` in `file` becomes `new`, and `test`, a pytest node, fails. `image`: it needs the RP2040's."""
 
     name: str
     file: str
     old: str
     new: str
     test: str
+    image: bool = False
 
     def plant(self, tree: Path) -> None:
         path = tree / self.file
@@ -68,19 +79,17 @@ class Tree:
             else:
                 shutil.copyfile(source, folder / name)
 
-    def run(self, tests: list[str]) -> tuple[int, str]:
+    def run(self, tests: list[str], patience_s: int = PATIENCE_S) -> tuple[int, str]:
         """Run tests; return pytest's exit status and what it said. A test that hangs has failed."""
-        command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "--hypothesis-seed=0", *tests]
-        paths = os.pathsep.join(str(self.path / name) for name in ("", "host"))
-        # Without byte code: a file that changes twice within a second would be taken for its older self.
-        environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
-        try:
-            done = subprocess.run(
-                command, cwd=self.path, env=environment, capture_output=True, text=True, timeout=PATIENCE_S
-            )
-        except subprocess.TimeoutExpired:
-            return FAILED, f"nothing for {PATIENCE_S} s"
-        return done.returncode, done.stdout + done.stderr
+        said = self.path / "said.txt"
+        process = PROCESSES.Process(target=_perform, args=(self.path, said, tests))
+        process.start()
+        process.join(patience_s)
+        if process.exitcode is None:
+            os.killpg(process.pid or 0, signal.SIGKILL)
+            process.join()
+            return FAILED, f"nothing for {patience_s} s"
+        return process.exitcode, said.read_text("utf-8", "replace")
 
     def judge(self, mutant: Mutant) -> tuple[bool, str, float]:
         """Return whether a mutant's test fails, what is to be said of it, and the seconds that it took."""
@@ -111,6 +120,8 @@ def main() -> int:
     for mutant in lost:
         print(f"{mutant.name}: {mutant.file} does not have this exactly once:\n{mutant.old}")
     planted = [mutant for mutant in mutants if mutant not in lost]
+    if any(mutant.image for mutant in planted) and not _has_image():
+        planted = [mutant for mutant in planted if not mutant.image]
     if not planted:
         print("no fault to plant")
         return 1
@@ -118,14 +129,30 @@ def main() -> int:
         trees = [Tree(Path(folder) / str(number)) for number in range(WORKERS)]
         tests = sorted({mutant.test for mutant in planted})
         print(f"running {len(tests)} tests as they are", flush=True)
-        status, said = trees[0].run(tests)
-        if status != PASSED:
-            print(f"they must pass before a fault is planted:\n{said}")
-            return 1
+        with ThreadPoolExecutor(WORKERS) as pool:
+            parts = [tests[number::WORKERS] for number in range(min(WORKERS, len(tests)))]
+            found = list(pool.map(lambda tree, part: tree.run(part, PATIENCE_WITHOUT_S), trees, parts))
+        for status, said in found:
+            if status != PASSED:
+                print(f"they must pass before a fault is planted:\n{said}")
+                return 1
         survivors = sum(not is_killed for is_killed in _judge_all(trees, planted))
     took_s = time.monotonic() - begun_s
-    print(f"{len(planted) - survivors} of {len(mutants)} planted faults found, in {took_s:.0f} s")
+    print(f"{len(planted) - survivors} of {len(planted)} planted faults found, in {took_s:.0f} s")
     return 1 if survivors or lost else 0
+
+
+def _has_image() -> bool:
+    """Return whether there is an image of the RP2040, or one can be built; say why not."""
+    from marotte.errors import MarotteError
+    from marotte.images import rp2040_image
+
+    try:
+        rp2040_image()
+    except (MarotteError, OSError) as error:
+        print(f"without what needs the RP2040's image: {error}")
+        return False
+    return True
 
 
 def _judge_all(trees: list[Tree], mutants: list[Mutant]):
@@ -144,6 +171,23 @@ def _judge_all(trees: list[Tree], mutants: list[Mutant]):
         for mutant, (is_killed, verdict, took_s) in zip(mutants, pool.map(judge, mutants), strict=True):
             print(f"{mutant.name:{width}}  {took_s:4.1f} s  {mutant.test.rpartition('/')[2]}  {verdict}", flush=True)
             yield is_killed
+
+
+def _perform(tree: Path, said: Path, tests: list[str]) -> None:
+    """Run tests in a tree, in this process, which ends with pytest's status."""
+    os.setsid()  # so that what it starts can be ended with it
+    output = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    os.chdir(tree)
+    paths = [str(tree / name) for name in ("", "host")]
+    sys.path[:0] = paths
+    # Without byte code: a file that changes twice within a second would be taken for its older self.
+    sys.dont_write_bytecode = True
+    os.environ |= {"PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
+    import pytest
+
+    sys.exit(pytest.main(["-x", "-p", "no:cacheprovider", "--hypothesis-seed=0", *tests]))
 
 
 def _complaint(said: str) -> str:

@@ -16,6 +16,7 @@ Direct a robot by hand:
     session.open()
     session.upload(marotte.build_tables(puppet, robot))
     session.arm()
+    session.wait_attached()
     session.start()
     happy = puppet.action_index("HAPPY_FACE")
     session.weight_targets(marotte.FRAME_NOW, {happy: marotte.weight_q28(1.0)})
@@ -26,6 +27,12 @@ Give it other tables while it moves; what keeps its name goes on:
 
     other = marotte.load_puppet("puppets/pet.toml")
     session.exchange(marotte.build_tables(other, robot), playing=puppet)
+
+Let it live without a host from the next time that it is switched on:
+
+    session.kill()
+    session.stop()
+    session.save(marotte.build_tables(puppet, robot), behaviour="CALM")
 
 Values are 0..1 for absolute DOFs and -1..1 for relative ones, weights 0..4, live channels 0..1, tempos factors. Whatever the user
 can do something about raises a subclass of `MarotteError`, whose text is complete.
@@ -39,7 +46,7 @@ from marotte.puppet import Puppet
 from marotte.puppet_file import load_puppet
 from marotte.rendering import RenderError, Rendering, render
 from marotte.score import Cue, Score, load_score
-from marotte.session import Session
+from marotte.session import LinkKilled, Session
 from marotte.tables import Tables, build_tables, weight_q28
 from marotte.tomlfile import FileMistakes, Mistake
 from marotte.wiring import Robot, load_robot
@@ -51,6 +58,7 @@ __all__ = [
     "FileMistakes",
     "ImportedCurve",
     "LinkError",
+    "LinkKilled",
     "MarotteError",
     "Mistake",
     "PortError",

@@ -6,17 +6,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from marotte.puppet import Puppet
+from marotte.limits import LimitsInUse
+from marotte.puppet import Dof, Puppet
 from marotte.puppet_file import read_puppet
 from marotte.score import read_score
+from marotte.tables import build_tables
 from marotte.tomlfile import Document, Mistake
-from marotte.wiring import read_robot
+from marotte.wiring import Robot, read_robot
 
 PUPPET = "puppet"
 SCORE = "score"
 ROBOT = "robot"
 
-_ROBOT_KEYS = {"output", "mcu", "link_timeout"}
+_ROBOT_KEYS = {
+    "output",
+    "chip",
+    "kill",
+    "mcu",
+    "link_timeout",
+    "rate",
+    "attach_interval",
+    "autostart",
+}
 
 
 @dataclass
@@ -24,7 +35,7 @@ class CheckReport:
     """What came of a check."""
 
     fine: list[str] = field(default_factory=list)
-    """A line for each file without a mistake."""
+    """A line for each file without a mistake, and what follows from it, indented."""
     mistakes: list[Mistake] = field(default_factory=list)
 
 
@@ -50,13 +61,42 @@ def check_files(paths: Sequence[str | Path]) -> CheckReport:
             kinds[kind].append(path)
         report.mistakes += document.mistakes
     puppets = [_check_puppet(path, report) for path in kinds[PUPPET]]
+    puppet_is_fine = not report.mistakes
     puppet = puppets[0] if len(puppets) == 1 else None
     for path in kinds[SCORE]:
         _check_score(path, puppet, len(puppets), report)
     for path in kinds[ROBOT]:
         robot, mistakes = read_robot(path, puppet)
         _note(report, path, mistakes, f"a robot with {_count(robot.outputs, 'output')}")
+        if not mistakes and (puppet is None or puppet_is_fine):
+            report.fine += describe(robot, puppet)
     return report
+
+
+def describe(robot: Robot, puppet: Puppet | None) -> list[str]:
+    """Return what the motor layer makes of a robot, and of the puppet on it: its rates, and each DOF's limits in use."""
+    period_us = robot.motor_period_us
+    lines = [f"  motor layer: a tick every {period_us} us, {1e6 / period_us:.4g} Hz"]
+    tables = build_tables(puppet, robot) if puppet else None
+    rows = []
+    for output in robot.outputs.values():
+        pulses = f"every {robot.period_us(output):.0f} us" if output.drive.has_pulses else "PWM of 20 kHz"
+        rate = f"written at {1e6 / robot.written_us(output):.4g} Hz"
+        limits = ""
+        if puppet and tables:
+            dof = puppet.dofs[output.dof]
+            limits = _limits(tables.limits(dof), dof)
+        rows.append((output.dof, output.drive.place, f"{pulses}, {rate}", limits))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        lines.append("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    return lines
+
+
+def _limits(limits: LimitsInUse, dof: Dof) -> str:
+    low, high = limits.range
+    speed = "" if dof.is_relative else f", speed {limits.speed:g}"
+    return f"range {low:g}..{high:g}{speed}, accel {limits.accel:g}"
 
 
 def _check_puppet(path: Path, report: CheckReport) -> Puppet:

@@ -17,8 +17,9 @@ from rich.console import Console
 
 from marotte import check, commands, curves, emulated
 from marotte.errors import MarotteError
-from marotte.files import Watch, load
-from marotte.tomlfile import FileMistakes
+from marotte.files import Watch, load, load_pair
+from marotte.tomlfile import FileMistakes, did_you_mean
+from marotte.wiring import load_robot
 from shared import formats
 
 FINE = 0
@@ -26,6 +27,8 @@ FAILURE = 1
 MISTAKE = 2
 INTERRUPTED = 130
 SECONDS_MAX = 1_000_000
+
+_FLASH_HELP = "what keeps an emulated MCU's flash from run to run: a file (rp2040) or a folder (unix, unix32)"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -57,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="marotte", description="Puppets that live on their own microcontroller, directed over a serial link."
     )
     commands_ = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_check, _add_render, _add_run, _add_ports, _add_mcu, _add_import_curve):
+    for add in (_add_check, _add_render, _add_run, _add_save, _add_calibrate, _add_ports, _add_mcu, _add_import_curve):
         add(commands_)
     return parser
 
@@ -124,15 +127,60 @@ def _add_run(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         "marotte run puppets/pet.toml --score puppets/pet-score.toml --mcu unix --watch",
     )
     _add_files(parser)
-    where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--port", help="the robot's serial port, or a URL that pyserial opens (see `marotte ports`)")
-    where.add_argument("--mcu", choices=emulated.KINDS, help="an emulated MCU, run in real time")
+    _add_where(parser)
     parser.add_argument("--arm", action="store_true", help="let the robot's outputs give pulses: it moves")
     parser.add_argument("--seconds", type=_seconds, help="stop after so long (default: 2 s after the last cue)")
     parser.add_argument(
         "--watch", action="store_true", help="load the files again when they change, and play on with them"
     )
     parser.add_argument("--no-view", action="store_true", help="print a line a cue instead of the moving picture")
+
+
+def _add_save(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands_,
+        "save",
+        "let an MCU keep a puppet on its flash, so that it plays without a host when it is switched on",
+        _save,
+        "marotte save puppets/pet.toml --robot puppets/pet-robot.toml --behaviour CALM --port /dev/ttyACM0",
+        "marotte save --erase --port /dev/ttyACM0",
+        "marotte save puppets/pet.toml --robot puppets/pet-robot.toml --mcu rp2040 --flash pico.bin",
+        "    then: marotte mcu rp2040 --flash pico.bin",
+    )
+    parser.add_argument("puppet", metavar="PUPPET", nargs="?", help="the puppet file")
+    parser.add_argument("--robot", help="the robot file: wiring, calibration, and whether it starts by itself")
+    parser.add_argument("--behaviour", metavar="NAME", help="what it does when it is switched on (default: it rests)")
+    parser.add_argument("--erase", action="store_true", help="forget what is kept, and keep nothing")
+    _add_where(parser)
+    parser.add_argument("--flash", type=Path, metavar="PATH", help=_FLASH_HELP)
+
+
+def _add_calibrate(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands_,
+        "calibrate",
+        "move one DOF of a robot by hand and set its pulses while it moves",
+        _calibrate,
+        "marotte calibrate puppets/pet-robot.toml NECK --port /dev/ttyACM0",
+        "    0              goes to the least value",
+        "    low 1040       and gets this pulse there, in us",
+        "    done           ends, and prints what belongs into the robot file",
+    )
+    parser.add_argument("robot", metavar="ROBOT", help="the robot file")
+    parser.add_argument("dof", metavar="DOF", help="the DOF of one of its outputs; the others stay off")
+    parser.add_argument(
+        "--relative",
+        action="store_true",
+        default=None,
+        help="it is a wheel (default: if its driver or keys are a wheel's)",
+    )
+    _add_where(parser)
+
+
+def _add_where(parser: argparse.ArgumentParser) -> None:
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--port", help="the robot's serial port, or a URL that pyserial opens (see `marotte ports`)")
+    where.add_argument("--mcu", choices=emulated.KINDS, help="an emulated MCU")
 
 
 def _add_ports(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -153,7 +201,7 @@ def _add_mcu(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     rp2040 = parser.add_argument_group("rp2040 only")
     rp2040.add_argument("--image", type=Path, metavar="FILE.uf2", help="another image than our own")
     rp2040.add_argument("--link", choices=("usb", "uart"), help="the line that is served (default: usb)")
-    rp2040.add_argument("--flash", type=Path, metavar="FILE", help="a file that keeps the flash from run to run")
+    parser.add_argument("--flash", type=Path, metavar="PATH", help=_FLASH_HELP)
 
 
 def _add_import_curve(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -259,6 +307,34 @@ def _run(options: argparse.Namespace) -> int:
     return INTERRUPTED if interrupted else FINE
 
 
+def _save(options: argparse.Namespace) -> int:
+    if options.flash and not options.mcu:
+        return _failed("marotte: --flash is for an emulated MCU, --mcu", MISTAKE)
+    if options.erase and (options.puppet or options.robot or options.behaviour):
+        return _failed("marotte: --erase takes no puppet, robot or behaviour", MISTAKE)
+    if not options.erase and not (options.puppet and options.robot):
+        return _failed("marotte: save needs PUPPET and --robot FILE, or --erase", MISTAKE)
+    what = None
+    if not options.erase:
+        puppet, robot = load_pair(options.puppet, options.robot)
+        if options.behaviour is not None and options.behaviour not in puppet.behaviours:
+            hint = did_you_mean(options.behaviour, puppet.behaviours)
+            return _failed(f"marotte: {options.puppet} has no behaviour {options.behaviour!r}{hint}", MISTAKE)
+        what = commands.Keeping(puppet, robot, options.behaviour)
+    commands.save(what, commands.Where(options.port, options.mcu or "", options.flash), Console())
+    return FINE
+
+
+def _calibrate(options: argparse.Namespace) -> int:
+    robot = load_robot(options.robot)
+    if options.dof not in robot.outputs:
+        hint = did_you_mean(options.dof, robot.outputs)
+        return _failed(f"marotte: {options.robot} has no output for {options.dof!r}{hint}", MISTAKE)
+    where = commands.Where(options.port, options.mcu or "")
+    commands.calibrate(robot, robot.outputs[options.dof], options.relative, where, Console())
+    return FINE
+
+
 def _ports(options: argparse.Namespace) -> int:
     commands.list_ports()
     return FINE
@@ -272,7 +348,7 @@ def _import_curve(options: argparse.Namespace) -> int:
 
 
 def _mcu(options: argparse.Namespace) -> int:
-    if options.kind != "rp2040" and (options.image or options.link or options.flash):
-        return _failed("marotte: --image, --link and --flash are for the rp2040 only", MISTAKE)
+    if options.kind != "rp2040" and (options.image or options.link):
+        return _failed("marotte: --image and --link are for the rp2040 only", MISTAKE)
     commands.serve_mcu(options.kind, options.tcp, options.image, options.link or "usb", options.flash)
     return FINE

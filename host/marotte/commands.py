@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+import queue
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,13 +16,24 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from marotte import ports
-from marotte.emulated import open_mcu
+from marotte.calibration import Calibration, CalibrationError
+from marotte.emulated import connected, open_mcu, without_feedback
 from marotte.errors import MarotteError
 from marotte.files import Files, Watch
-from marotte.link import LinkError
+from marotte.link import Carrier, LinkError, VirtualCarrier
+from marotte.outputs import Output
 from marotte.ports import SerialCarrier
 from marotte.pulses import PulseSummary, measure
+from marotte.puppet import Puppet
+from marotte.session import Session
+from marotte.signals import interruptible
+from marotte.tables import build_tables
 from marotte.view import View
+from marotte.wiring import Robot
+
+PUMP_US = 20_000
+GONE = {"rest": "goes to rest", "relax": "goes to rest and lets go"}
+"""What a puppet does when the host is gone, by its `when_silent`; with any other it goes on."""
 
 
 def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console: Console) -> None:
@@ -74,16 +89,131 @@ def run_on_mcu(files: Files, mcu: str, options: RunOptions, console: Console) ->
     """Play live on an emulated MCU and show the pulses of its pins; return whether the user ended it. Raises MarotteError."""
     from marotte.mcu.serve import serve
 
-    with open_mcu(mcu) as virtual, serve(virtual) as live:
+    with contextlib.ExitStack() as stack:
+        virtual = stack.enter_context(open_mcu(mcu))
+        if files.robot:
+            files = replace(files, robot=connected(virtual, files.robot))
+        if options.watch:
+            options.watch.adapt = without_feedback
+        live = stack.enter_context(serve(virtual))
         carrier = SerialCarrier(live.url)
         try:
             interrupted = _perform(files, carrier, f"emulated {mcu} at {live.url}", options, console)
         finally:
             carrier.close()
-        if files.robot and options.arm:
+        has_pins = files.robot and any(output.drive.pulse_pin for output in files.robot.outputs.values())
+        if files.robot and options.arm and has_pins:
             live.stop()
             _print_pulses(measure(virtual, files.robot), console)
     return interrupted
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """What an MCU is to keep on its flash."""
+
+    puppet: Puppet
+    robot: Robot
+    behaviour: str | None = None
+
+
+def save(what: Keeping | None, where: Where, console: Console) -> None:
+    """Let an MCU keep a puppet, or with None forget the one that it keeps. Raises MarotteError."""
+    with _carrier(where) as (carrier, name):
+        try:
+            _save(what, Session(carrier), name, console)
+        except LinkError as error:
+            raise LinkError(f"{name}: {error}") from error
+
+
+def _save(what: Keeping | None, session: Session, name: str, console: Console) -> None:
+    session.open()
+    session.kill()  # flash is written only while the outputs are off and nothing moves
+    session.stop()
+    if what is None:
+        session.erase_saved()
+        _say(console, f"the flash of {name} keeps no puppet any more")
+        return
+    tables = build_tables(what.puppet, what.robot)
+    session.upload(tables)  # so that it is checked now, and not when the MCU is switched on
+    session.save(tables, what.behaviour)
+    does = f"does {what.behaviour}" if what.behaviour else "stands at rest"
+    outputs = "its outputs are armed by themselves" if what.robot.autostart else "its outputs are off until it is armed"
+    _say(console, f"{what.puppet.name} is kept on the flash of {name}")
+    _say(console, f"switched on, it {does}; {outputs}")
+    if what.puppet.when_silent in GONE:
+        _say(console, f"once a host has come and gone, it {GONE[what.puppet.when_silent]}")
+
+
+@dataclass(frozen=True)
+class Where:
+    """A port, or an emulated MCU and what keeps its flash."""
+
+    port: str | None = None
+    mcu: str = "unix"
+    flash: Path | None = None
+
+
+@contextlib.contextmanager
+def _carrier(where: Where) -> Iterator[tuple[Carrier, str]]:
+    """Yield a carrier to an MCU and what it is called."""
+    if where.port:
+        serial = SerialCarrier(where.port)
+        try:
+            yield serial, where.port
+        finally:
+            serial.close()
+    else:
+        with open_mcu(where.mcu, where.flash) as virtual:
+            yield VirtualCarrier(virtual), f"the emulated {where.mcu}"
+
+
+def calibrate(robot: Robot, output: Output, relative: bool | None, where: Where, console: Console) -> None:
+    """Let the user calibrate an output, command by command from standard input. Raises MarotteError."""
+    with contextlib.ExitStack() as stack:
+        if where.port:
+            url = name = where.port
+        else:
+            from marotte.mcu.serve import serve
+
+            virtual = stack.enter_context(open_mcu(where.mcu))
+            robot = connected(virtual, robot)
+            url, name = stack.enter_context(serve(virtual)).url, f"the emulated {where.mcu}"
+        carrier = stack.enter_context(contextlib.closing(SerialCarrier(url)))
+        try:
+            _calibrate(Session(carrier), robot, robot.outputs[output.dof], relative, console)
+        except LinkError as error:
+            raise LinkError(f"{name}: {error}") from error
+
+
+def _calibrate(session: Session, robot: Robot, output: Output, relative: bool | None, console: Console) -> None:
+    session.open()
+    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+    with interruptible(), Calibration(session, robot, output, relative) as calibration:
+        _say(console, f"{output.dof} at {output.drive.place} has its pulses. Commands: {calibration.commands}")
+        threading.Thread(target=_read_lines, args=(lines,), daemon=True).start()
+        while True:
+            session.pump(PUMP_US)
+            with contextlib.suppress(queue.Empty):
+                line = lines.get_nowait()
+                if line.strip() == "done":
+                    break
+                try:
+                    _say(console, calibration.do(line))
+                except CalibrationError as error:
+                    _say(console, str(error))
+    _say(console, f"{output.dof} is off. For the robot file:\n\n{calibration.text()}")
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _read_lines(lines: queue.SimpleQueue[str]) -> None:
+    """Hand on the lines of standard input, and at its end the command that ends."""
+    for line in sys.stdin:
+        lines.put(line)
+    lines.put("done")
 
 
 def serve_mcu(kind: str, tcp: int | None, image: Path | None, link: str, flash: Path | None) -> None:
@@ -95,7 +225,7 @@ def serve_mcu(kind: str, tcp: int | None, image: Path | None, link: str, flash: 
         if kind == "rp2040":
             live_mcu = serve_rp2040(tcp, image=image, link=link, flash=flash)
         else:
-            live_mcu = serve(stack.enter_context(open_mcu(kind)), tcp)
+            live_mcu = serve(stack.enter_context(open_mcu(kind, flash)), tcp)
         live = stack.enter_context(live_mcu)
         print(f"the emulated {kind} is at {live.url}   (Ctrl-C ends it)", flush=True)
         live.wait()
@@ -132,7 +262,8 @@ def _perform(files: Files, carrier: SerialCarrier, where: str, options: RunOptio
     status = performance.status
     how = "stopped by hand" if performance.is_interrupted else "played"
     late = f", {status['late_frames']} late, at most {status['late_max_us']} us" if status else ""
-    console.print(f"{how}: {performance.frames} frames{late}; outputs are off", highlight=False)
+    errors = f"; {status['bus_errors']} errors on the I2C bus" if status.get("bus_errors") else ""
+    console.print(f"{how}: {performance.frames} frames{late}{errors}; outputs are off", highlight=False)
     return performance.is_interrupted
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from marotte import wiring
@@ -38,10 +39,23 @@ def load(puppet_path: str | Path, score_path: str | Path, robot_path: str | Path
     return Files(puppet, score, robot)
 
 
+def load_pair(puppet_path: str | Path, robot_path: str | Path) -> tuple[Puppet, Robot]:
+    """Return a puppet and its robot. Raises FileMistakes, with the mistakes of both files."""
+    puppet, mistakes = read_puppet(puppet_path)
+    if not puppet.dofs:
+        raise FileMistakes(mistakes)
+    robot, robot_mistakes = wiring.read_robot(robot_path, puppet)
+    if mistakes or robot_mistakes:
+        raise FileMistakes([*mistakes, *robot_mistakes])
+    return puppet, robot
+
+
 class Watch:
     """Loads the files of a performance again when one of them has changed, and been left alone since the last look."""
 
     def __init__(self, puppet: str | Path, score: str | Path, robot: str | Path | None = None) -> None:
+        self.adapt: Callable[[Robot], Robot] | None = None
+        """What to make of the robot that has been loaded, if anything."""
         self._paths = (puppet, score, robot)
         self._loaded = self._seen = self._look()
         self._looked_us: int | None = None
@@ -55,7 +69,8 @@ class Watch:
         if self._seen in (None, self._loaded) or self._seen != before:
             return None
         self._loaded = self._seen
-        return load(*self._paths)
+        files = load(*self._paths)
+        return replace(files, robot=self.adapt(files.robot)) if self.adapt and files.robot else files
 
     def _look(self) -> tuple[tuple[int, int], ...] | None:
         """Return time and size of each file; None while one is missing, as it is for a moment when an editor replaces it."""

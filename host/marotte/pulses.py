@@ -43,14 +43,15 @@ def pulses(edges: Sequence[tuple[int, int]]) -> list[Pulse]:
 
 
 def measure(mcu: VirtualMcu, robot: Robot) -> list[PulseSummary]:
-    """Return what the pins of a robot have done until they were killed; outputs that gave no pulse are left out.
+    """Return what the servo pins of a robot have done until they were killed; those that gave no pulse are left out.
 
     The last pulse of a pin does not count: the kill has driven the pin low, perhaps in the middle of it.
     """
     summaries = []
     for output in robot.outputs.values():
-        widths_us = [pulse.width_ns / 1000 for pulse in pulses(mcu.edges(output.pin))[:-1]]
-        if widths_us:
+        pin = output.drive.pulse_pin
+        widths_us = [] if pin is None else [pulse.width_ns / 1000 for pulse in pulses(mcu.edges(pin))[:-1]]
+        if pin is not None and widths_us:
             least_us, greatest_us = min(widths_us), max(widths_us)
-            summaries.append(PulseSummary(output.dof, output.pin, len(widths_us), widths_us[-1], least_us, greatest_us))
+            summaries.append(PulseSummary(output.dof, pin, len(widths_us), widths_us[-1], least_us, greatest_us))
     return summaries

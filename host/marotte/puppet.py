@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from marotte.functions import Function
+from marotte.limits import Limits, LimitsInUse, tightest
 
 ABSOLUTE = "absolute"
 RELATIVE = "relative"
@@ -24,8 +25,11 @@ class Character:
     """Second-order dynamics of a DOF."""
 
     f_hz: float
+    """How quickly it follows."""
     zeta: float
+    """Damping: below 1 it follows through."""
     r: float
+    """Initial response: below 0 it anticipates, above 0 it sets off at once, above 1 too far."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +46,19 @@ class Dof:
     signal: bool = True
     """Whether the DOF passes through signal processing."""
     character: Character | None = None
+    speed: float | None = None
+    """Most that an absolute DOF's value changes in a second; None if the puppet does not say."""
+    accel: float | None = None
+    """Most that its speed (relative: its value) changes in a second; None if the puppet does not say."""
 
     @property
     def is_relative(self) -> bool:
         """Whether values are velocities in -1..1 instead of positions in 0..1."""
         return self.kind == RELATIVE
+
+    def limits_with(self, *others: Limits) -> LimitsInUse:
+        """Return what holds when others, a robot's, have limits too."""
+        return tightest(self.is_relative, Limits(self.limits, self.speed, self.accel), *others)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any
 
 from marotte.function_tables import FunctionReader
 from marotte.functions import Function, FunctionError
+from marotte.limits import Limits, read_limits, read_range, whole_range
 from marotte.pools import Pools
 from marotte.positions import KeyPath
 from marotte.puppet import (
@@ -36,6 +37,9 @@ GAIN_RANGE = (-4, 4)
 TAU_RANGE_S = (0.03, 10)
 WARP_RANGE_S = (0.05, 10)
 CYCLES_RANGE = (1, formats.CYCLES_MAX)
+FREQUENCY_RANGE_HZ = (0.2, 10)
+DAMPING_RANGE = (0.1, 3)
+RESPONSE_RANGE = (-4, 4)
 SEED_MAX = 2**32 - 1
 MASTER_NAME = "global"
 """What a score's tempo table calls the master tempo; no action can have this name."""
@@ -97,8 +101,6 @@ class _Reader:
         seed = root.integer("seed", 0, SEED_MAX, Puppet.seed)
         noise_spread = root.number("noise_spread", 0, 1, 0.0)
         when_silent = root.choice("when_silent", ("idle", "rest", "relax"), "idle")
-        if when_silent != "idle":
-            root.not_yet("when_silent", "when_silent")
         curves = self.functions.curves(root)
         self.blinking = self.blinking_dofs()
         dofs = {name: self.dof(table, name) for name, table in root.tables("dof")}
@@ -128,16 +130,13 @@ class _Reader:
     def dof(self, table: Table, name: str) -> Dof:
         kind = table.choice("kind", (ABSOLUTE, RELATIVE), ABSOLUTE)
         relative = kind == RELATIVE
-        low, high = (-1.0, 1.0) if relative else (0.0, 1.0)
         rest = 0.0 if relative else 0.5
         if table.has("rest"):
             if not relative:
                 rest = table.number("rest", 0, 1, rest)
             elif table.value("rest") != 0:
                 table.mistake(f"found {found(table.value('rest'))}, expected 0: a relative DOF rests at 0", "rest")
-        limits = table.numbers("limits", 2, low, high, what="the least and the greatest value")
-        if limits and limits[0] >= limits[1]:
-            table.mistake(f"found {found(table.value('limits'))}, expected the least value first", "limits")
+        limits = _limits(table, relative)
         signal = table.boolean("signal", default=None)
         blinks = name in self.blinking
         if signal and blinks:
@@ -145,7 +144,8 @@ class _Reader:
         character = self.character(table) if table.has("character") else None
         table.finish()
         is_processed = signal if signal is not None else not (relative or blinks)
-        return Dof(name, kind, rest, (limits[0], limits[1]) if limits else (low, high), is_processed, character)
+        range_ = limits.range or whole_range(relative)
+        return Dof(name, kind, rest, range_, is_processed, character, limits.speed, limits.accel)
 
     def blinking_dofs(self) -> set[object]:
         """Return the names of the DOFs that any mapping, in any action, makes blink."""
@@ -157,11 +157,12 @@ class _Reader:
         return {dof for dof, function in parsed if isinstance(function, Function) and function.blinks}
 
     def character(self, table: Table) -> Character:
-        table.not_yet("character", "character")
         inner = table.table("character")
-        inner.require("f", "a frequency in Hz, 0.2..10")
+        inner.require("f", f"a frequency in Hz, {FREQUENCY_RANGE_HZ[0]:g}..{FREQUENCY_RANGE_HZ[1]:g}")
         character = Character(
-            inner.number("f", 0.2, 10, 1), inner.number("zeta", 0.1, 3, 1), inner.number("r", -4, 4, 0)
+            inner.number("f", *FREQUENCY_RANGE_HZ, default=1),
+            inner.number("zeta", *DAMPING_RANGE, default=1),
+            inner.number("r", *RESPONSE_RANGE, default=0),
         )
         inner.finish()
         return character
@@ -263,6 +264,16 @@ class _Reader:
         ):
             if count > most:
                 self.root.mistake(f"has {count} {what}, expected at most {most}", key)
+
+
+def _limits(table: Table, relative: bool) -> Limits:
+    """Return the limits of a DOF: `limits` is its range, or a table that names speed and acceleration too."""
+    if not isinstance(table.value("limits"), dict):
+        return Limits(read_range(table, "limits", relative))
+    inner = table.table("limits")
+    limits = read_limits(inner, relative)
+    inner.finish()
+    return limits
 
 
 def _tau(table: Table, default: tuple[float, float]) -> tuple[float, float]:

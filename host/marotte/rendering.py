@@ -19,7 +19,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from marotte.emulated import open_mcu
+from marotte.emulated import connected, open_mcu
 from marotte.errors import MarotteError
 from marotte.link import VirtualCarrier
 from marotte.mcu.base import VirtualMcu
@@ -102,13 +102,16 @@ def render(
     """Return what the puppet does in the first `seconds` of a score.
 
     `mcu` is `"unix"` (MicroPython on this machine, 64 bits), `"unix32"`, `"rp2040"` (the emulated chip), or an emulated MCU just
-    switched on, which stays open, so that its pins can be looked at. With a robot its outputs are armed before frame 0.
-    Raises MarotteError: RenderError, or what the link or the emulated MCU has to say.
+    switched on, which stays open, so that its pins can be looked at; what is connected to it is the caller's business then. With
+    a robot its outputs are armed and attached before frame 0. Raises MarotteError: RenderError, or what the link or the emulated
+    MCU has to say.
     """
     count = frame_count(seconds, puppet.frame_rate_hz)
     if count < 1:
         raise RenderError(f"{float(seconds):g} s hold no frame at {puppet.frame_rate_hz} frames a second")
     with _open_mcu(mcu) as virtual:
+        if robot and isinstance(mcu, str):
+            robot = connected(virtual, robot)
         session = Session(VirtualCarrier(virtual))
         session.open()
         session.upload(build_tables(puppet, robot))
@@ -117,6 +120,7 @@ def render(
         prompter.reached(-1)
         if robot and robot.outputs:
             session.arm()
+            session.wait_attached()  # an output that is not attached stands still
         session.start()
         rendering = Rendering(puppet)
         _collect(session, prompter, rendering, count, progress)
@@ -136,7 +140,10 @@ def _open_mcu(mcu: str | VirtualMcu) -> Iterator[VirtualMcu]:
 
 
 def _collect(session: Session, prompter: Prompter, rendering: Rendering, count: int, progress: Progress | None) -> None:
-    """Let the MCU compute `count` frames, sending it what it needs ahead, and keep the taps."""
+    """Let the MCU compute `count` frames and what it takes until the motor tap of the last is known, and keep the taps.
+
+    What it needs is sent ahead.
+    """
     dofs = list(rendering.puppet.dofs.values())
     for taps in (rendering.base, rendering.signal, rendering.motor):
         taps.update((dof.name, []) for dof in dofs)

@@ -3,6 +3,8 @@
 session = Session(SerialCarrier("/dev/ttyACM0"))
 session.open()
 session.upload(build_tables(puppet, robot))
+session.arm()
+session.wait_attached()     # if it is to move from its first frame on
 session.start()
 session.weight_targets(FRAME_NOW, {0: weight_q28(1.0)})
 session.pump(20_000)        # often: at least every 200 ms, or the MCU finds the link silent
@@ -14,13 +16,23 @@ from collections import deque
 from collections.abc import Callable
 from functools import partial
 
+from marotte.keeping import kept
+from marotte.limits import Limits
 from marotte.link import Carrier, Link, LinkError, LinkRefused, LinkSilent, Message
+from marotte.outputs import Output
 from marotte.puppet import Puppet
-from marotte.tables import Tables, items_per_message, keeps
-from shared import codec, messages
+from marotte.tables import Message as Command
+from marotte.tables import Tables, calibration_fields, items_per_message, keeps, limit_fields
+from shared import codec, formats, messages
 
 OPEN_TIMEOUT_S = 1.5
 UPLOAD_TIMEOUT_S = 5.0
+SAVE_TIMEOUT_S = 10.0
+"""Erasing and writing flash keeps the MCU from answering for a while."""
+ATTACH_TIMEOUT_S = 2.0
+"""Beyond the intervals at which outputs are attached."""
+LOOK_US = 20_000
+"""How often the MCU is asked while its outputs are being attached."""
 PING_US = 100_000
 GREETING_US = 150_000
 STEP_US = 2_000
@@ -31,6 +43,23 @@ DICTIONARY = codec.crc32(messages.canonical_text().encode())
 
 class LinkForeign(LinkError):
     """What answers at the port is not this version of Marotte's firmware."""
+
+
+class LinkKilled(LinkError):
+    """The outputs have lost their pulses, or not got them."""
+
+
+KILLERS = {
+    formats.KILLED_BY_NOBODY: "nobody",
+    formats.KILLED_BY_HOST: "the host",
+    formats.KILLED_BY_PIN: "the kill pin",
+    formats.KILLED_BY_STOPPED_TICKS: "the firmware, as the motor layer's ticks had stopped",
+}
+
+
+def killer(status: dict[str, int]) -> str:
+    """Return who took the pulses away last, as a status says."""
+    return KILLERS.get(status["killed_by"], f"cause {status['killed_by']}")
 
 
 class Session:
@@ -47,7 +76,9 @@ class Session:
         self.welcome: dict[str, int] = {}
         self.taps: deque[tuple[int, int, list[int]]] = deque()
         self.weights: tuple[int, dict[int, int]] = (-1, {})
+        self._tables: Tables | None = None
         self._status: dict[str, int] = {}
+        self._motor_status: dict[str, int] = {}
         self._posted_us = carrier.now_us()
 
     def open(self, timeout_s: float = OPEN_TIMEOUT_S) -> None:
@@ -92,9 +123,10 @@ class Session:
                 progress(max(0, len(parts) - self.link.pending), len(parts))
         if refused:
             raise refused[0]
+        self._tables = tables
 
     def exchange(self, tables: Tables, playing: Puppet) -> None:
-        """Replace the tables of a puppet that moves, at the beginning of a frame.
+        """Replace the tables of a puppet that moves, between two frames.
 
         `playing` is the puppet whose tables the MCU has; actions, DOFs and live channels that keep their names keep weights,
         phases, poses and values. The frame rate has to be the same. Raises LinkRefused if the MCU refuses a part; the old tables
@@ -109,13 +141,14 @@ class Session:
         end_us = self.carrier.now_us() + round(UPLOAD_TIMEOUT_S * 1e6)
         while self._post_all([begin]):  # refused as long as the exchange is being prepared
             self._step(end_us, "the exchange of tables was not carried out")
+        self._tables = tables
 
-    def _post_all(self, group: list[tuple[str, dict[str, int], list[dict[str, int]]]]) -> list[LinkRefused]:
+    def _post_all(self, group: list[Command], timeout_s: float = UPLOAD_TIMEOUT_S) -> list[LinkRefused]:
         """Send commands, wait until all are answered; return what the MCU refused."""
         refused: list[LinkRefused] = []
         for name, fields, items in group:
             self._post(name, fields, items, partial(_note_refusal, refused, name))
-        self.flush(UPLOAD_TIMEOUT_S)
+        self.flush(timeout_s)
         return refused
 
     def start(self) -> None:
@@ -127,8 +160,85 @@ class Session:
         self._post("stop")
 
     def arm(self) -> None:
-        """Let pulses flow."""
+        """Let pulses flow: the outputs are attached one after the other, each from where its DOF was last."""
         self._post("arm")
+
+    def wait_attached(self, timeout_s: float | None = None) -> None:
+        """Wait until all outputs of the tables have been attached after `arm`.
+
+        The default timeout is what their intervals take, and a little more. Raises LinkKilled if that does not happen, or if
+        somebody has killed them meanwhile.
+        """
+        tables = self._tables
+        if tables is None:
+            raise LinkError("nothing to wait for: this session has uploaded no tables")
+        wanted = tables.outputs_mask
+        if timeout_s is None:
+            timeout_s = wanted.bit_count() * tables.robot.attach_interval_s + ATTACH_TIMEOUT_S
+        end_us = self.carrier.now_us() + round(timeout_s * 1e6)
+        self.flush()
+        while True:
+            status = self.status()
+            missing = wanted & ~(status["attached"] | status["released"] | status["stalled"])
+            if not missing:
+                return
+            if not status["armed"]:
+                raise LinkKilled(f"the outputs are off again: killed by {killer(status)}")
+            if self.carrier.now_us() >= end_us:
+                names = [name for index, name in enumerate(tables.puppet.dofs) if missing >> index & 1]
+                raise LinkKilled(f"{', '.join(names)}: no pulses after {timeout_s:g} s; are all chips connected?")
+            self.pump(LOOK_US)
+
+    def calibrate(self, output: Output) -> None:
+        """Change the calibration of one of the robot's outputs, while it plays; what the MCU keeps on its flash stays as it is.
+
+        Raises KeyError if the tables that play have no such DOF.
+        """
+        index, _ = self._dof(output.dof)
+        self._post("calibrate", {"dof": index, **calibration_fields(output)})
+
+    def limit(self, dof: str, limits: Limits) -> None:
+        """Hold a DOF to these limits and to the puppet's, the tighter of both, while it plays.
+
+        Raises KeyError if the tables that play have no such DOF.
+        """
+        index, tables = self._dof(dof)
+        known = tables.puppet.dofs[dof]
+        self._post("limit", {"dof": index, **limit_fields(known.limits_with(limits), known, tables.tick_s)})
+
+    def save(
+        self, tables: Tables, behaviour: str | None = None, progress: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Let the MCU keep a puppet and its robot on its flash: it plays them by itself when it is switched on.
+
+        `behaviour` names what it does then; by default it stands at rest. `progress(done, all)` is called as it goes on. Raises
+        LinkRefused while frames run or outputs are armed, LinkError for a puppet that is too large, KeyError for an unknown
+        behaviour.
+        """
+        data = kept(tables, behaviour)
+        if len(data) > formats.STORE_MAX:
+            raise LinkError(f"the puppet takes {len(data)} bytes, but the MCU keeps {formats.STORE_MAX} at most")
+        room = items_per_message("save")
+        parts: list[Command] = [("save_begin", {"bytes": len(data), "crc32": codec.crc32(data)}, [])]
+        for place in range(0, len(data), room):
+            parts.append(("save", {"place": place}, [{"byte": byte} for byte in data[place : place + room]]))
+        parts.append(("save_end", {}, []))
+        for number, part in enumerate(parts):
+            refused = self._post_all([part], SAVE_TIMEOUT_S)
+            if refused:
+                raise refused[0]
+            if progress:
+                progress(number + 1, len(parts))
+
+    def erase_saved(self) -> None:
+        """Let the MCU forget what it keeps on its flash. Raises LinkRefused while frames run or outputs are armed."""
+        self._post("save_erase")
+        self.flush(SAVE_TIMEOUT_S)
+
+    def _dof(self, name: str) -> tuple[int, Tables]:
+        if self._tables is None or name not in self._tables.puppet.dofs:
+            raise KeyError(name)
+        return list(self._tables.puppet.dofs).index(name), self._tables
 
     def kill(self) -> None:
         """Take all pulses away, before anything else that has not been sent yet; an `arm` among that is withdrawn."""
@@ -157,17 +267,33 @@ class Session:
         self._post_items("tempo", frame, [{"action": action, "tempo_q16": tempo_q16}], on_refused)
 
     def telemetry(self, taps: int, taps_every: int, weights_every: int) -> None:
-        """Ask for taps (bits of TAP_BASE, TAP_SIGNAL, TAP_MOTOR) and weights, every so many frames; 0 is never."""
+        """Ask for taps (bits of TAP_BASE, TAP_SIGNAL, TAP_MOTOR) and weights, every so many frames; 0 is never.
+
+        The taps of a frame come when its motor tap is known, one or two frames later.
+        """
         self._post("telemetry", {"taps": taps, "taps_every": taps_every, "weights_every": weights_every})
 
     def status(self, timeout_s: float = 1.0) -> dict[str, int]:
-        """Return the MCU's counters: the fields of the status message."""
-        self._status = {}
-        self._post("status_request")
+        """Return the MCU's counters: the fields of `status` and `motor_status` together."""
+        self.request_status()
         end_us = self.carrier.now_us() + round(timeout_s * 1e6)
-        while not self._status:
+        while not (status := self.take_status()):
             self._step(end_us, "the MCU sent no status")
-        return self._status
+        return status
+
+    def request_status(self) -> None:
+        """Ask for the MCU's counters without waiting for them; `take_status` has them when they have come."""
+        self._status = {}
+        self._motor_status = {}
+        self._post("status_request")
+
+    def take_status(self) -> dict[str, int]:
+        """Return what `request_status` has asked for, once; empty until it has come."""
+        if not self._status or not self._motor_status:
+            return {}
+        status = {**self._status, **self._motor_status}
+        self._status, self._motor_status = {}, {}
+        return status
 
     def pump(self, wait_us: int) -> None:
         """Let at most `wait_us` pass, take what has come, keep the link alive."""
@@ -218,6 +344,8 @@ class Session:
             self.weights = (message.fields["frame"], weights)
         elif message.name == "status":
             self._status = message.fields
+        elif message.name == "motor_status":
+            self._motor_status = message.fields
 
     def _no_welcome(self, timeout_s: float) -> LinkError:
         if b">>>" in self.link.tail or b"raw REPL" in self.link.tail:

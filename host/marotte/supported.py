@@ -7,7 +7,5 @@ a file is ever ignored silently. Performing a feature means deleting its entry h
 NOT_YET = {
     "gains": "a band gain other than 1",
     "kalman": 'predict = "kalman"',
-    "character": "character",
-    "when_silent": 'when_silent other than "idle"',
 }
 """Feature, as the readers call it, and its description at the beginning of "... is not supported by this version"."""

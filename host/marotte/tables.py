@@ -5,21 +5,26 @@
         print(name, fields, items)
 
 Everything is rounded to nearest, halves up; the formats are those of `shared/formats.py`. A positive weight target never
-becomes 0, as that would end the action instead of making it faint.
+becomes 0, as that would end the action instead of making it faint; speeds and accelerations, per motor tick, are rounded down.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import TypeAlias
 
+from marotte.character import response
 from marotte.fixed import fixed
+from marotte.limits import LimitsInUse
+from marotte.link import PAYLOAD_SENT_MAX
+from marotte.outputs import Feedback, Output
 from marotte.pools import Pools
 from marotte.puppet import Action, Dof, MappingEntry, Puppet
 from marotte.wiring import Robot
-from shared import codec, formats, messages
+from shared import formats, messages
 
 Message: TypeAlias = tuple[str, dict[str, int], list[dict[str, int]]]
 """Name, fields, and items: see `shared/messages.py`."""
@@ -27,8 +32,13 @@ Message: TypeAlias = tuple[str, dict[str, int], list[dict[str, int]]]
 HOLD_TAU_S = 0.25
 """How HOLD, which takes over what no action moves, comes and goes."""
 
-UPLOAD_ITEMS_MAX = {"mappings": 8, "curve": 32, "program": 32}
+UPLOAD_ITEMS_MAX = {"mappings": 8, "curve": 32, "program": 18}
 """Most items of a message of an upload: what an RP2040 checks in 2 ms, so that no frame waits long for it."""
+
+ACCEL_MIN_Q24 = 2
+"""The least acceleration per tick that the motor layer can brake with."""
+
+SILENT = {"idle": formats.SILENT_IDLE, "rest": formats.SILENT_REST, "relax": formats.SILENT_RELAX}
 
 _MESSAGES = {name: (fields, items) for name, _, fields, items in messages.MESSAGES}
 
@@ -46,11 +56,15 @@ class Tables:
         pools = Pools(puppet.functions, list(puppet.lives))
         mappings = [self._mapping(entry, pools) for action in puppet.actions.values() for entry in action.mappings]
         yield "begin", self._begin(len(mappings), pools), []
+        yield "robot", self._robot(), []
+        for index, chip in enumerate(self.robot.chips.values()):
+            yield "device", {"device": index, "driver": chip.code}, _items("setting", chip.settings())
         for index, dof in enumerate(puppet.dofs.values()):
-            yield "dof", _dof(index, dof), []
-        for index, name in enumerate(puppet.dofs):
-            if name in self.robot.outputs:
-                yield "output", self._output(index, name), []
+            yield "dof", self._dof(index, dof), []
+        for index, dof in enumerate(puppet.dofs.values()):
+            if dof.character:
+                yield "character", {"dof": index, **response(dof.character, self.tick_s).fixed()}, []
+        yield from self._outputs()
         first = 0
         for index, action in enumerate(puppet.actions.values()):
             yield "action", self._action(index, action, first), []
@@ -84,12 +98,69 @@ class Tables:
             "noise_spread_q15": fixed(puppet.noise_spread, formats.VALUE_BITS),
             "hold_q26": alpha_q26(HOLD_TAU_S, puppet.frame_rate_hz),
             "link_timeout_ms": fixed(self.robot.link_timeout_s * 1000, 0),
+            "when_silent": SILENT[puppet.when_silent],
         }
 
-    def _output(self, index: int, name: str) -> dict[str, int]:
-        output = self.robot.outputs[name]
-        pulse0, pulse1 = (fixed(end, formats.PULSE_BITS) for end in output.ends_us)
-        return {"dof": index, "pin": output.pin, "pulse0_q4us": pulse0, "pulse1_q4us": pulse1}
+    def _robot(self) -> dict[str, int]:
+        robot = self.robot
+        return {
+            "motor_period_us": robot.motor_period_us,
+            "attach_ms": fixed(robot.attach_interval_s * 1000, 0),
+            "kill_pin": robot.kill.pin if robot.kill else formats.NO_PIN,
+            "kill_level": robot.kill.level if robot.kill else 0,
+            "autostart": int(robot.autostart),
+        }
+
+    @property
+    def tick_s(self) -> Fraction:
+        """The motor layer's period."""
+        return Fraction(self.robot.motor_period_us, 1_000_000)
+
+    @property
+    def outputs_mask(self) -> int:
+        """The DOFs that have an output, a bit each."""
+        return sum(1 << index for index, name in enumerate(self.puppet.dofs) if name in self.robot.outputs)
+
+    def limits(self, dof: Dof) -> LimitsInUse:
+        """Return what a DOF is held to: the tighter of what puppet and robot say."""
+        output = self.robot.outputs.get(dof.name)
+        return dof.limits_with(output.limits) if output else dof.limits_with()
+
+    def _dof(self, index: int, dof: Dof) -> dict[str, int]:
+        return {
+            "dof": index,
+            "kind": formats.KIND_RELATIVE if dof.is_relative else formats.KIND_ABSOLUTE,
+            "rest_q15": value_q15(dof.rest, dof),
+            **limit_fields(self.limits(dof), dof, self.tick_s),
+        }
+
+    def _outputs(self) -> Iterator[Message]:
+        """Yield the outputs of all DOFs, then their feedbacks, then their guards."""
+        names = list(self.puppet.dofs)
+        outputs = [(index, self.robot.outputs[name]) for index, name in enumerate(names) if name in self.robot.outputs]
+        for index, output in outputs:
+            fields = {"dof": index, "driver": output.drive.code, "turns": self.robot.turns(output)}
+            settings = output.drive.settings(output.invert, self.robot.chips)
+            yield "output", {**fields, **calibration_fields(output)}, _items("setting", settings)
+        for index, output in outputs:
+            if output.feedback:
+                yield "feedback", {"dof": index, **self._feedback(output.feedback)}, []
+        for index, output in outputs:
+            if output.release_s is not None or output.duty.share < 1:
+                yield "guard", {"dof": index, **_guard(output)}, []
+
+    def _feedback(self, feedback: Feedback) -> dict[str, int]:
+        at0, at1 = (fixed(ratio, formats.VALUE_BITS) for ratio in feedback.at)
+        return {
+            "pin": feedback.pin,
+            "at0_q15": at0,
+            "at1_q15": at1,
+            "gain_q15": fixed(feedback.gain, formats.VALUE_BITS),
+            "integral_q24": fixed(Fraction(feedback.integral) * self.tick_s, formats.POSITION_BITS),
+            "most_q15": fixed(feedback.most, formats.VALUE_BITS),
+            "stall_q15": fixed(feedback.stall, formats.VALUE_BITS),
+            "stall_ticks": max(1, fixed(Fraction(feedback.stall_time_s) / self.tick_s, 0)),
+        }
 
     def _action(self, index: int, action: Action, first_mapping: int) -> dict[str, int]:
         rise, fall = (alpha_q26(tau_s, self.puppet.frame_rate_hz) for tau_s in action.tau_s)
@@ -151,6 +222,41 @@ def value_of(value: int, dof: Dof) -> float:
     return 2 * share - 1 if dof.is_relative else share
 
 
+def limit_fields(limits: LimitsInUse, dof: Dof, tick_s: Fraction) -> dict[str, int]:
+    """Return limits as the messages `dof` and `limit` have them, speed and acceleration per motor tick.
+
+    Rounded down, so that the motor layer, which adds them up exactly, never exceeds what they say; yet a wheel's acceleration is
+    never below what brings it to a stand in time.
+    """
+    low_q15, high_q15 = (value_q15(value, dof) for value in limits.range)
+    if dof.is_relative:  # travels as (value + 1) / 2
+        unit_tick = (1 << formats.POSITION_BITS - 1) * tick_s
+        speed_q24 = formats.POSITION_ONE
+        stand = math.ceil(unit_tick * 1000 / formats.STAND_MS)
+        accel_q24 = max(math.floor(Fraction(limits.accel) * unit_tick), stand)
+    else:
+        unit_tick = formats.POSITION_ONE * tick_s
+        speed_q24 = math.floor(Fraction(limits.speed) * unit_tick)
+        accel_q24 = max(math.floor(Fraction(limits.accel) * unit_tick * tick_s) - 1, ACCEL_MIN_Q24)
+    return {
+        "low_q15": low_q15,
+        "high_q15": high_q15,
+        "speed_q24": speed_q24,
+        "accel_q24": min(accel_q24, formats.POSITION_ONE),
+    }
+
+
+def calibration_fields(output: Output) -> dict[str, int]:
+    """Return an output's calibration as the messages `output` and `calibrate` have it; a bridge has no pulses, hence no ends."""
+    end0_us, end1_us = output.ends_us if output.drive.has_pulses else (0.0, 0.0)
+    return {
+        "end0_q4us": fixed(end0_us, formats.PULSE_BITS),
+        "end1_q4us": fixed(end1_us, formats.PULSE_BITS),
+        "dead_q15": fixed(output.dead_band, formats.VALUE_BITS),
+        "top_q15": fixed(output.top_speed, formats.VALUE_BITS),
+    }
+
+
 def weight_q28(weight: float) -> int:
     """Return a weight, weight target or live value; what is above 0 stays above 0."""
     return max(fixed(weight, formats.WEIGHT_BITS), 1 if weight > 0 else 0)
@@ -167,23 +273,25 @@ def alpha_q26(tau_s: float, frame_rate_hz: int) -> int:
 
 
 def items_per_message(name: str) -> int:
-    """Return how many items a message of this name has room for."""
+    """Return how many items a message of this name is sent with at most."""
     fields, items = _MESSAGES[name]
-    return (codec.PAYLOAD_MAX - messages.size(fields)) // messages.size(items)
+    return (PAYLOAD_SENT_MAX - messages.size(fields)) // messages.size(items)
 
 
 def _in_parts(name: str, fields: dict[str, int], item: str, values: Sequence[int]) -> Iterator[Message]:
     """Yield as many messages of this name as the values need, in order; `item` is the field of an item."""
     step = UPLOAD_ITEMS_MAX[name]
     for start in range(0, len(values), step):
-        yield name, fields, [{item: value} for value in values[start : start + step]]
+        yield name, fields, _items(item, values[start : start + step])
 
 
-def _dof(index: int, dof: Dof) -> dict[str, int]:
+def _items(field: str, values: Iterable[int]) -> list[dict[str, int]]:
+    return [{field: value} for value in values]
+
+
+def _guard(output: Output) -> dict[str, int]:
     return {
-        "dof": index,
-        "kind": formats.KIND_RELATIVE if dof.is_relative else formats.KIND_ABSOLUTE,
-        "rest_q15": value_q15(dof.rest, dof),
-        "low_q15": value_q15(dof.limits[0], dof),
-        "high_q15": value_q15(dof.limits[1], dof),
+        "release_ms": fixed((output.release_s or 0) * 1000, 0),
+        "duty_q15": fixed(output.duty.share, formats.VALUE_BITS),
+        "window_s": fixed(output.duty.window_s, 0),
     }

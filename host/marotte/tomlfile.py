@@ -123,8 +123,10 @@ class Document:
         return frozenset(self._values)
 
     def mistake(self, path: KeyPath, text: str) -> None:
-        """Note a mistake at a key path."""
-        self.mistakes.append(Mistake(str(self.path), self._lines.get(path), key_text(path), text))
+        """Note a mistake at a key path; one that is not in the file is placed at the table that it belongs to."""
+        prefixes = (path[:length] for length in range(len(path), 0, -1))
+        line = next((self._lines[prefix] for prefix in prefixes if prefix in self._lines), None)
+        self.mistakes.append(Mistake(str(self.path), line, key_text(path), text))
 
     def not_yet(self, path: KeyPath, feature: str) -> None:
         """Note a mistake if this version does not perform `feature`, a key of `supported.NOT_YET`."""

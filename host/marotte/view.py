@@ -45,6 +45,12 @@ class Scene:
     cue: str = ""
     """The last cue, as its line says it."""
     late_frames: int = 0
+    stalled: frozenset[str] = frozenset()
+    """DOFs that do not move although they should, and have lost their pulses for it."""
+    released: frozenset[str] = frozenset()
+    """DOFs without pulses that get them back when they have to move."""
+    alert: str = ""
+    """What is wrong with the robot, if anything is."""
     is_silent: bool = False
     """Whether the MCU has not been heard for a while."""
 
@@ -119,16 +125,24 @@ class View:
             if value is None:
                 grid.add_row(name, Text(_TRACK * BAR_WIDTH, style="dim"), "", "")
             else:
-                grid.add_row(name, _dof_bar(value, dof), f"{value:.3f}", self._pulse(name, value, dof))
+                grid.add_row(name, _dof_bar(value, dof), f"{value:.3f}", self._output(name, value, dof, scene))
         return grid
 
-    def _pulse(self, name: str, value: float, dof: Dof) -> str:
+    def _output(self, name: str, value: float, dof: Dof, scene: Scene) -> RenderableType:
+        """Return where a DOF's output is and what it gets."""
         output = self.robot.outputs.get(name) if self.robot else None
         if output is None:
             return ""
+        if name in scene.stalled:
+            return Text(f"{output.drive.place} stalled", style="yellow")
+        if name in scene.released:
+            return f"{output.drive.place} released"
+        level = output.drive_of(value) if dof.is_relative else value
+        if not output.drive.has_pulses:
+            return f"{output.drive.place} {level:+7.1%}"
         low_us, high_us = output.ends_us
-        share = (value + 1) / 2 if dof.is_relative else value
-        return f"GP{output.pin} {low_us + (high_us - low_us) * share:6.1f} us"
+        share = (level + 1) / 2 if dof.is_relative else level
+        return f"{output.drive.place} {low_us + (high_us - low_us) * share:6.1f} us"
 
     def _weights(self, scene: Scene) -> RenderableType:
         columns, bar_width, gap = (2, WEIGHT_WIDTH, 2) if len(self.puppet.actions) <= FEW_ACTIONS else (3, 4, 1)
@@ -152,7 +166,8 @@ class View:
         line = Table.grid(expand=True)
         line.add_column()
         line.add_column(justify="right")
-        left = Text("no word from the MCU", style="yellow") if scene.is_silent else Text(scene.cue, style="italic")
+        alert = "no word from the MCU" if scene.is_silent else scene.alert
+        left = Text(alert, style="yellow") if alert else Text(scene.cue, style="italic")
         late = f"{scene.late_frames} late frames  " if scene.late_frames else ""
         line.add_row(left, Text.assemble((late, "yellow"), ("Ctrl-C stops", "dim")))
         return line

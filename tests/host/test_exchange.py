@@ -9,9 +9,11 @@ from fractions import Fraction
 import pytest
 
 import marotte
+from marotte.emulated import without_feedback
 from marotte.files import LOOK_US, Files, Watch, load
 from marotte.link import LinkRefused, VirtualCarrier
 from marotte.mcu.unix import UnixMcu
+from marotte.pulses import pulses
 from marotte.puppet_file import load_puppet
 from marotte.run import perform
 from marotte.tables import keeps
@@ -229,6 +231,43 @@ def test_watch_does_not_begin_gestures_again_and_takes_tempos_back(paths):
     assert view.last.weights.get("TWO", 0) < 0.05
 
 
+STALLS = "[output.B]\npin = 2\nfeedback = { pin = 26, at = [0, 1], gain = 0, integral = 0 }\n"
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "pins"),
+    [
+        ("p.toml", PUPPET.replace("tempo = 0.7", "tempo = 0.8"), set()),
+        ("p.toml", PUPPET.replace("[dof.A]", "[dof.NEW]\n[dof.A]"), set()),
+        ("r.toml", STALLS + "trim_us = 5\nspeed = 2\n", set()),
+        ("r.toml", "link_timeout = 1\n" + STALLS + "[output.A]\npin = 4\n", {2, 4}),
+        ("r.toml", STALLS.replace("pin = 2\n", "pin = 6\n"), {6}),
+    ],
+)
+def test_watch_arms_again_for_new_outputs_alone(paths, tmp_path, path, text, pins):
+    robot = tmp_path / "r.toml"
+    robot.write_text(STALLS)
+    files = load(*paths, robot)
+    edits = [(tmp_path / path, text)]
+    with UnixMcu() as mcu:
+
+        def act(scene):
+            if scene.frame >= 20:
+                mcu.set_adc(26, 0.9)  # far from its rest: it counts as stalled
+            if scene.stalled and edits:
+                mcu.clear_edges()
+                rewrite(*edits.pop())
+
+        mcu.set_adc(26, 0.2)
+        view = WatchingView(files.puppet, act)
+        watch = Watch(*paths, robot)
+        options = {"robot": files.robot, "arm": True, "seconds": Fraction(4), "watch": watch}
+        perform(files.puppet, files.score, VirtualCarrier(mcu), view, **options)
+        assert view.notes[1] == "B has stalled: it is without pulses until it is armed again"
+        assert sum(note.startswith("p exchanged in ") for note in view.notes) == 1
+        assert {pin for pin in (2, 4, 6) if pulses(mcu.edges(pin))} == pins
+
+
 def test_watch_looks_at_intervals_and_waits_for_a_file_at_rest(paths):
     watch = Watch(*paths)
     assert watch.changed(0) is None
@@ -247,6 +286,17 @@ def test_watch_waits_for_a_file_that_is_gone_for_a_moment(paths):
     paths[0].write_text(text + "\n[dof.C]\n")
     assert watch.changed(3 * LOOK_US) is None
     assert "C" in watch.changed(4 * LOOK_US).puppet.dofs
+
+
+def test_watch_adapts_the_robot_that_it_loads(paths, tmp_path):
+    robot = tmp_path / "robot.toml"
+    robot.write_text("[output.A]\npin = 2\nfeedback = { pin = 26, at = [0, 1] }\n")
+    watch = Watch(*paths, robot)
+    watch.adapt = without_feedback
+    rewrite(robot, robot.read_text() + "rate = 60\n")
+    assert watch.changed(0) is None
+    output = watch.changed(LOOK_US).robot.outputs["A"]
+    assert (output.feedback, output.rate_hz) == (None, 60)
 
 
 def test_watch_tells_a_mistake_once(paths):

@@ -2,6 +2,7 @@
 
 import csv
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -67,9 +68,48 @@ def test_rendering_is_the_same_on_every_mcu(tmp_path, pet, pet_score, rp2040_ima
     assert (tmp_path / "unix").read_bytes() == (tmp_path / "unix32").read_bytes() == (tmp_path / "rp2040").read_bytes()
 
 
-def test_rendering_is_the_same_with_armed_outputs(pet, pet_score):
-    robot = marotte.load_robot(PUPPETS / "pet-robot.toml", pet)
-    assert marotte.render(pet, pet_score, 2).motor == marotte.render(pet, pet_score, 2, robot=robot).motor
+def test_rendering_is_the_same_with_armed_outputs(tmp_path, pet, pet_score):
+    alone = marotte.render(pet, pet_score, 2)
+    path = tmp_path / "robot.toml"
+    path.write_text(
+        "attach_interval = 0.4\n[output.HEAD_YAW]\npin = 2\n[output.NECK]\npin = 3\n[output.BACK]\npin = 4\n"
+    )
+    assert marotte.render(pet, pet_score, 2, robot=marotte.load_robot(path, pet)).motor == alone.motor
+    for name in ("pet-robot.toml", "pet-robot-pca9685.toml"):  # whose limits are narrower
+        armed = marotte.render(pet, pet_score, 2, robot=marotte.load_robot(PUPPETS / name, pet))
+        assert (armed.base, armed.signal) == (alone.base, alone.signal)
+
+
+def test_rendering_ignores_the_potentiometers_that_an_emulated_mcu_lacks(tmp_path, pet, pet_score):
+    path = tmp_path / "robot.toml"
+    path.write_text("[output.NECK]\npin = 2\nfeedback = { pin = 26, at = [0.1, 0.9] }\n")
+    rendering = marotte.render(pet, pet_score, 2, robot=marotte.load_robot(path, pet))
+    assert rendering.motor == marotte.render(pet, pet_score, 2).motor
+
+
+def test_rendering_holds_speed_and_acceleration(tmp_path):
+    puppet = """
+    frame_rate = 50
+    [dof.A]
+    limits = { range = [0.1, 0.8], speed = 2.0, accel = 10.0 }
+    [dof.W]
+    kind = "relative"
+    limits = { range = [-0.5, 1], accel = 5 }
+    [action.SHAKE]
+    tempo = 2
+    tau = 0.03
+    map = [["A", -0.0, 1, "rsin"], ["W", -1, 1, "rsin"]]
+    """
+    score = "[[cue]]\nat=0\nweights={SHAKE=4}\n"
+    rendering = marotte.render(*files(tmp_path, puppet, score)[:2], 4)
+    a, w = rendering.motor["A"], rendering.motor["W"]
+    speeds = [50 * (after - before) for before, after in pairwise(a)]
+    unit = 50 / 32768  # what rounding of the taps adds to a difference
+    assert min(a) >= 0.1 - 1e-4 and max(a) <= 0.8 + 1e-4
+    assert 1.5 < max(map(abs, speeds)) <= 2 + unit
+    assert max(abs(after - before) for before, after in pairwise(speeds)) * 50 <= 10 + 2 * 50 * unit
+    assert min(w) >= -0.5 - 1e-4 and max(w) <= 1
+    assert 4 < max(abs(after - before) for before, after in pairwise(w)) * 50 <= 5 + 2 * unit
 
 
 def test_rendering_writes_the_columns_of_the_documentation(tmp_path, pet, pet_score):

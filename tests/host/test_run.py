@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 from rich.console import Console
 
 import marotte
-from marotte.link import LinkSilent, VirtualCarrier
+from marotte.link import LinkRefused, LinkSilent, VirtualCarrier
 from marotte.mcu.unix import UnixMcu
 from marotte.pulses import measure, pulses
 from marotte.run import perform
@@ -30,16 +31,17 @@ class Watch(View):
     def __init__(self, puppet, then=lambda scene: None):
         super().__init__(puppet, None, "here", 1, Console(file=io.StringIO()))
         self.then = then
+        self.notes = []
         self.told = []
         self.frames = []
         self.last = Scene()
 
     def note(self, text):
-        self.notes = text
+        self.notes.append(text)
 
     def show(self, scene):
         self.frames.append(scene.frame)
-        self.last = Scene(scene.frame, dict(scene.values), dict(scene.weights), scene.cue)
+        self.last = replace(scene, values=dict(scene.values), weights=dict(scene.weights))
         self.then(scene)
 
     def cue(self, at_s, text):
@@ -63,7 +65,7 @@ def is_off(mcu, robot):
     """Return whether no output gives pulses any more: half a second brings no edge."""
     mcu.clear_edges()
     mcu.run_for(500_000)
-    return all(mcu.edges(output.pin) == [] for output in robot.outputs.values())
+    return all(mcu.edges(output.drive.pulse_pin) == [] for output in robot.outputs.values())
 
 
 def test_run_plays_tells_and_stops(pet, mcu):
@@ -72,7 +74,7 @@ def test_run_plays_tells_and_stops(pet, mcu):
     performance = perform(puppet, score, VirtualCarrier(mcu), watch, robot=robot, arm=True, seconds=Fraction(4))
     assert not performance.is_interrupted
     assert 120 <= performance.frames <= 125
-    assert re.fullmatch(r"pet uploaded in \d+ ms, on here", watch.notes)
+    assert re.fullmatch(r"pet uploaded in \d+ ms, on here", "".join(watch.notes))
     assert [text for _, text in watch.told] == [
         "TIRED, mood WEARY",
         "CALM, mood EVEN",
@@ -114,7 +116,7 @@ def test_run_kills_the_outputs_whatever_ends_it(pet, mcu, error):
     else:
         with pytest.raises(error):
             perform(puppet, score, carrier, watch, robot=robot, arm=True)
-    assert all(pulses(mcu.edges(output.pin)) for output in robot.outputs.values())
+    assert all(pulses(mcu.edges(output.drive.pulse_pin)) for output in robot.outputs.values())
     assert is_off(mcu, robot)
 
 
@@ -140,6 +142,87 @@ def test_run_again_on_a_puppet_that_is_still_moving(pet, mcu):
     mcu.run_for(3_000_000)
     performance = perform(puppet, score, VirtualCarrier(mcu), Watch(puppet), seconds=Fraction(1))
     assert 30 <= performance.frames <= 35
+
+
+def robot_of(tmp_path, puppet, text):
+    (tmp_path / "robot.toml").write_text(text)
+    return marotte.load_robot(tmp_path / "robot.toml", puppet)
+
+
+def test_run_tells_that_the_kill_pin_has_acted(pet, mcu):
+    puppet, score, robot = pet
+
+    def press(scene):
+        if scene.frame > 30:
+            mcu.set_pin(robot.kill.pin, 0)
+
+    watch = Watch(puppet, press)
+    performance = perform(puppet, score, VirtualCarrier(mcu), watch, robot=robot, arm=True, seconds=Fraction(3))
+    assert watch.notes[1:] == ["all pulses are off: killed by the kill pin"]
+    assert watch.last.alert == "killed by the kill pin"
+    assert performance.frames >= 90
+    assert is_off(mcu, robot)
+
+
+def test_run_cannot_arm_while_the_kill_switch_is_open(pet, mcu, tmp_path):
+    puppet, score, _ = pet
+    robot = robot_of(tmp_path, puppet, "[kill]\npin=22\n[output.NECK]\npin=2\n")
+    with pytest.raises(LinkRefused, match=r"refused 'arm'.*is its kill switch where it should be"):
+        perform(puppet, score, VirtualCarrier(mcu), Watch(puppet), robot=robot, arm=True, seconds=Fraction(1))
+    mcu.set_pin(22, 0)
+    perform(puppet, score, VirtualCarrier(mcu), Watch(puppet), robot=robot, arm=True, seconds=Fraction(1))
+    assert pulses(mcu.edges(2))
+
+
+def test_run_tells_that_a_chip_is_gone_and_back(pet, mcu, tmp_path):
+    puppet, score, _ = pet
+    robot = robot_of(
+        tmp_path,
+        puppet,
+        '[chip.FACE]\nsda=4\nscl=5\noe=6\n[output.NECK]\ndriver="pca9685"\nchip="FACE"\nchannel=3\n',
+    )
+    chip = mcu.add_pca9685(0, 0x40, 6)
+    alerts = []
+    later = [(30, chip.remove), (75, chip.put_back)]
+
+    def pull(scene):
+        alerts.append(scene.alert)
+        if later and scene.frame >= later[0][0]:
+            later.pop(0)[1]()
+
+    watch = Watch(puppet, pull)
+    performance = perform(puppet, score, VirtualCarrier(mcu), watch, robot=robot, arm=True, seconds=Fraction(5))
+    assert watch.notes[1:] == ["the chip FACE does not answer", "the chip FACE answers again"]
+    assert "FACE does not answer" in alerts and alerts[-1] == ""
+    assert performance.status["bus_errors"] > 0
+    assert pulses(chip.edges(3))
+
+
+def test_run_tells_of_a_stall(pet, mcu, tmp_path):
+    puppet, score, _ = pet
+    feedback = "{ pin = 26, at = [0, 1], gain = 0, integral = 0 }"
+    robot = robot_of(tmp_path, puppet, f"[output.NECK]\npin=2\nfeedback={feedback}\n")
+    mcu.set_adc(26, 0.65)
+
+    def block(scene):
+        if scene.frame > 20:
+            mcu.set_adc(26, 0.05)
+
+    watch = Watch(puppet, block)
+    perform(puppet, score, VirtualCarrier(mcu), watch, robot=robot, arm=True, seconds=Fraction(4))
+    assert watch.notes[1:] == ["NECK has stalled: it is without pulses until it is armed again"]
+    assert watch.last.stalled == {"NECK"}
+
+
+def test_run_shows_what_has_been_released(pet, mcu, tmp_path):
+    puppet, _, _ = pet
+    robot = robot_of(tmp_path, puppet, "[output.NECK]\npin=2\nrelease=0.5\n[output.BACK]\npin=4\n")
+    score = marotte.Score((marotte.Cue(Fraction(3), weights={"NEUTRAL_BODY": 1.0}),))
+    seen = []
+    watch = Watch(puppet, lambda scene: seen.append(scene.released))
+    perform(puppet, score, VirtualCarrier(mcu), watch, robot=robot, arm=True, seconds=Fraction(5))
+    assert {"NECK"} in seen and seen[-1] == frozenset()
+    assert len(watch.notes) == 1
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -1,5 +1,7 @@
 """The exchange of tables: every state array is gathered by the list of old places; equal functions are found."""
 
+import itertools
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,6 +17,9 @@ any_word = integers(-(1 << 31), (1 << 31) - 1, 0)
 any_half = integers(0, 65535)
 places = st.lists(st.integers(0, COUNT - 1) | st.just(formats.NEW), min_size=COUNT, max_size=COUNT)
 counts = st.integers(0, COUNT)
+ROWS = 3
+rows = st.integers(0, ROWS - 1)
+"""An array may have several values for each owner, row by row."""
 
 
 def lists_of(numbers):
@@ -26,18 +31,24 @@ def gathered(values, old, count, fresh):
     return new + values[count:]
 
 
-@given(lists_of(any_word), places, counts, any_word)
-def test_words_go_where_their_owners_went(values, old, count, fresh):
-    found = words(values)
-    MODULE.gather_words(found, bytes(old), words([-1] * COUNT), count, fresh)
-    assert list(found) == gathered(values, old, count, fresh)
+@given(lists_of(any_word), places, counts, any_word, rows)
+def test_words_go_where_their_owners_went(values, old, count, fresh, row):
+    others = [[n] * COUNT for n in range(ROWS)]
+    others[row] = values
+    found = words(list(itertools.chain(*others)))
+    MODULE.gather_words(found, bytes(old), words([-1] * COUNT), count, fresh, row * COUNT)
+    others[row] = gathered(values, old, count, fresh)
+    assert list(found) == list(itertools.chain(*others))
 
 
-@given(lists_of(any_half), places, counts, any_half)
-def test_halves_go_where_their_owners_went(values, old, count, fresh):
-    found = halves(values)
-    MODULE.gather_halves(found, bytes(old), words([-1] * COUNT), count, fresh)
-    assert list(found) == gathered(values, old, count, fresh)
+@given(lists_of(any_half), places, counts, any_half, rows)
+def test_halves_go_where_their_owners_went(values, old, count, fresh, row):
+    others = [[n] * COUNT for n in range(ROWS)]
+    others[row] = values
+    found = halves(list(itertools.chain(*others)))
+    MODULE.gather_halves(found, bytes(old), words([-1] * COUNT), count, fresh, row * COUNT)
+    others[row] = gathered(values, old, count, fresh)
+    assert list(found) == list(itertools.chain(*others))
 
 
 @given(places, *[lists_of(tempos_q16)] * 4, counts)

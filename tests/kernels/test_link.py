@@ -1,5 +1,6 @@
 """The link's kernels: packets gathered from chunks, telemetry packed, and the packet codec."""
 
+import struct
 import zlib
 from array import array
 
@@ -12,6 +13,7 @@ from tests.checked import load_checked
 from tests.kernels.values import halves, integers, weights_q28, words
 
 LINK = load_checked("firmware/link.py")
+TELEMETRY = load_checked("firmware/telemetry.py")
 CODEC = load_checked("shared/codec.py")
 BODY_MAX, WIRE_MAX = CODEC.BODY_MAX, CODEC.WIRE_MAX
 
@@ -31,18 +33,31 @@ def test_collecting_appends_up_to_the_zero_and_never_beyond_the_room(chunk, star
     assert wire == expected
 
 
-@given(st.integers(0, 8), st.lists(integers(0, 65535, 32768), max_size=48))
-def test_values_are_packed_little_endian(at, values):
+@given(st.integers(0, 8), st.integers(0, 3), st.lists(integers(0, 65535, 32768), max_size=48), st.integers(0, 2))
+def test_values_are_packed_little_endian_from_their_place_on(at, first, values, others):
     body = bytearray(b"\xa5" * (at + 2 * len(values) + 3))
-    end = LINK._pack_values(body, at, len(values), halves(values))
+    ring = halves([0xA5A5] * first + values + [0x5A5A] * others)
+    end = TELEMETRY._pack_values(body, at, len(values), ring, first)
     assert end == at + 2 * len(values)
     assert body == b"\xa5" * at + b"".join(value.to_bytes(2, "little") for value in values) + b"\xa5" * 3
+
+
+words_of_32_bits = integers(-(1 << 31), (1 << 31) - 1, -1, 0, 1, -(1 << 15), 1 << 16)
+
+
+@given(st.integers(0, 8), st.lists(st.tuples(words_of_32_bits, words_of_32_bits), max_size=16))
+def test_pairs_of_words_are_packed_little_endian_with_their_sign(at, pairs):
+    body = bytearray(b"\xa5" * (at + 8 * len(pairs) + 3))
+    first, second = (words([pair[n] for pair in pairs]) for n in range(2))
+    end = TELEMETRY._pack_pairs(body, at, len(pairs), first, second)
+    assert end == at + 8 * len(pairs)
+    assert body == b"\xa5" * at + b"".join(struct.pack("<ii", *pair) for pair in pairs) + b"\xa5" * 3
 
 
 @given(st.integers(0, 8), st.lists(st.integers(0, 63), max_size=64), st.lists(weights_q28, min_size=64, max_size=64))
 def test_weights_are_packed_in_q12_rounded(at, playing, weights):
     body = bytearray(at + 3 * len(playing))
-    end = LINK._pack_weights(body, at, len(playing), bytes(playing), words(weights))
+    end = TELEMETRY._pack_weights(body, at, len(playing), bytes(playing), words(weights))
     assert end == len(body)
     expected = [bytes([i]) + ((weights[i] + (1 << 15)) // (1 << 16)).to_bytes(2, "little") for i in playing]
     assert body[at:] == b"".join(expected)
@@ -86,7 +101,10 @@ def test_coding_of_the_longest_bodies_fits_its_buffers(size, fill):
 def test_telemetry_of_the_largest_puppet_fits_a_packet():
     taps = 3
     body = bytearray(BODY_MAX)
-    end = LINK._pack_values(body, 7, taps * formats.DOFS_MAX, halves([65535] * taps * formats.DOFS_MAX))
+    values = halves([65535] * formats.FRAMES_KEPT * formats.DOFS_MAX)
+    end = TELEMETRY._pack_values(body, 7, taps * formats.DOFS_MAX, values, 0)
     assert end + 4 <= BODY_MAX
-    end = LINK._pack_weights(body, 6, formats.ACTIONS_MAX, bytes(range(64)), array("i", [formats.WEIGHT_MAX] * 64))
+    end = TELEMETRY._pack_weights(body, 6, formats.ACTIONS_MAX, bytes(range(64)), array("i", [formats.WEIGHT_MAX] * 64))
     assert end + 4 <= BODY_MAX
+    derivatives = words([-1] * formats.DOFS_MAX)
+    assert TELEMETRY._pack_pairs(body, 6, formats.DOFS_MAX, derivatives, derivatives) + 4 <= BODY_MAX

@@ -1,9 +1,11 @@
-"""Motor and board: clamped values, calibrated pulses and PWM registers, in 32 bits over all values and pulse widths."""
+"""The board's kernels: what they write to the RP2040's registers, in 32 bits, over all pins, widths and positions.
 
-import itertools
+Addresses and bits are those of the RP2040 data sheet.
+"""
+
 import math
 import types
-from array import array
+from collections import defaultdict
 from fractions import Fraction
 
 import pytest
@@ -12,21 +14,107 @@ from hypothesis import strategies as st
 
 from shared import formats
 from tests.checked import Pointer, load_checked
-from tests.kernels.values import halves, integers, values_q15
+from tests.kernels.values import integers, words
 
-ONE = formats.VALUE_ONE
-STILL = ONE // 2
-MOTOR = load_checked("firmware/motor.py", bytecode=("Motor.move", "Motor._ease", "Motor.stand", "Motor._write"))
-BOARD = load_checked("firmware/board_rp2040.py", overrides={"machine": types.SimpleNamespace()})
+ADDRESSES = [
+    "_start_slice",
+    "_clear",
+    "_drive",
+    "_quiet",
+    "_compare",
+    "_pulses",
+    "_level",
+    "_convert",
+    "_converted",
+    "_later",
+    "_alarm_us",
+    "_guard",
+    "_feed",
+    "_bitten",
+    "_keep",
+    "_kept",
+    "_keep_pose",
+    "_tag",
+]
+"""Kernels that compute addresses or bit patterns, for which 32 bits need no sign."""
 
-PWM_ADDRESS = 0x40050000
-"""RP2040 data sheet, 2.2.4; its 8 slices of CSR, DIV, CTR, CC and TOP follow each other (4.5.3)."""
+BOARD = load_checked(
+    "firmware/board_rp2040.py", overrides={"machine": types.SimpleNamespace()}, patterns=frozenset(ADDRESSES)
+)
+
+PSM_WDSEL = 0x40010008
+PADS_BANK0 = 0x4001C000
+PAD_AFTER_RESET = 0x56  # RP2040 data sheet, table 341: its output is enabled
+IO_BANK0 = 0x40014000
+PADS_BANK0 = 0x4001C000
+ADC = 0x4004C000
+PWM = 0x40050000
+TIMER_ALARM3 = 0x4005401C
+WATCHDOG = 0x40058000
+GPIO_IN, GPIO_OUT_SET, GPIO_OUT_CLR, GPIO_OE_SET = 0xD0000004, 0xD0000014, 0xD0000018, 0xD0000024
+KEPT = 0x20040000
+SET, CLEAR = 0x2000, 0x3000
+"""Offsets of a register's aliases that set and clear the bits written as 1 (data sheet, 2.1.2)."""
 
 SLICE_BYTES = 0x14
-CC = 3
+CSR, DIV, CTR, CC, TOP = range(0, SLICE_BYTES, 4)
+FUNCTION_PWM, FUNCTION_SIO, FUNCTION_NULL = 4, 5, 31
 
-pulses_q4us = integers(formats.PULSE_MIN_US << formats.PULSE_BITS, formats.PULSE_MAX_US << formats.PULSE_BITS)
-any_halves = integers(0, 65535)
+OFF, PULSES, CONNECTS, CLEARS = range(4)
+PINS = (*range(2, 23), *range(26, 29))
+SERVO_COUNT_US = Fraction(40, 125)
+
+pulses_q18us = integers(formats.PULSE_MIN_US << 18, formats.PULSE_MAX_US << 18)
+periods_us = st.integers(formats.MOTOR_PERIOD_MIN_US // 8, 20968 // 8).map(lambda eighths: 8 * eighths)
+pins = st.sampled_from(PINS)
+
+
+class Memory:
+    """All registers; stands in for the cast of an address to `ptr32`. `written` lists the stores in order."""
+
+    def __init__(self):
+        self.word = defaultdict(int)
+        self.written = []
+
+    def __call__(self, address):
+        if not isinstance(address, int):
+            return Pointer(address, 32)
+        return _Words(self, address & 0xFFFFFFFF)
+
+    def compare(self, pin):
+        """Return the compare value of a pin's channel: A, the even pin's, is the lower half."""
+        return self.word[slice_of(pin) + CC] >> (16 if pin % 2 else 0) & 0xFFFF
+
+    def function(self, pin):
+        return self.word[IO_BANK0 + 8 * pin + 4]
+
+
+class _Words:
+    def __init__(self, memory, address):
+        assert address % 4 == 0
+        self._memory = memory
+        self._address = address
+
+    def __getitem__(self, index):
+        word = self._memory.word[self._address + 4 * index]
+        return word - (1 << 32) if word >> 31 else word
+
+    def __setitem__(self, index, value):
+        address = self._address + 4 * index
+        assert -(1 << 31) <= value < 1 << 31
+        value &= 0xFFFFFFFF
+        self._memory.written.append((address, value))
+        if address >> 28 == 4 and address & 0x3000 == SET:
+            self._memory.word[address - SET] |= value
+        elif address >> 28 == 4 and address & 0x3000 == CLEAR:
+            self._memory.word[address - CLEAR] &= ~value
+        else:
+            self._memory.word[address] = value
+
+
+def slice_of(pin):
+    """Return the address of the slice that a pin belongs to."""
+    return PWM + SLICE_BYTES * (pin // 2 % 8)
 
 
 def rounded(fraction):
@@ -34,119 +122,226 @@ def rounded(fraction):
     return math.floor(fraction + Fraction(1, 2))
 
 
-def move(signal, relative, ease, low, high, pulse0, pulse1):
-    """Return (motor_q15, pulse_q4us) of one DOF."""
-    motor, pulse = halves([0]), halves([0])
-    columns = (halves([value]) for value in (low, high))
-    MOTOR._move(
-        1, halves([signal]), bytes([relative]), ease, *columns, motor, halves([pulse0]), halves([pulse1]), pulse
-    )
-    return motor[0], pulse[0]
-
-
-@given(values_q15, st.booleans(), values_q15, values_q15, values_q15, any_halves, any_halves)
-def test_motor_clamps_and_calibrates(signal, relative, ease, one_limit, other_limit, pulse0, pulse1):
-    low, high = sorted((one_limit, other_limit))
-    value = rounded(STILL + Fraction((signal - STILL) * ease, ONE)) if relative else signal
-    value = min(max(value, low), high)
-    expected = rounded(pulse0 + (pulse1 - pulse0) * Fraction(value, ONE))
-    assert move(signal, relative, ease, low, high, pulse0, pulse1) == (value, expected)
-
-
-@pytest.mark.parametrize(
-    ("signal", "low", "high", "pulse0", "pulse1", "expected"),
-    [
-        (0, 0, ONE, 16_000, 32_000, (0, 16_000)),
-        (ONE, 0, ONE, 16_000, 32_000, (ONE, 32_000)),
-        (ONE, 0, ONE, 32_000, 16_000, (ONE, 16_000)),
-        (ONE, 0, 30_000, 0, ONE, (30_000, 30_000)),
-        (0, 2_000, ONE, 0, ONE, (2_000, 2_000)),
-        (STILL, 0, ONE, 16_000, 32_000, (STILL, 24_000)),
-    ],
-)
-def test_motor_reaches_both_ends_exactly(signal, low, high, pulse0, pulse1, expected):
-    assert move(signal, False, ONE, low, high, pulse0, pulse1) == expected
-
-
-@pytest.mark.parametrize("rate_hz", [10, 30, 60])
-def test_motor_eases_relative_dofs_to_a_stand_within_300_ms(rate_hz):
-    tables = types.SimpleNamespace(
-        dofs=2,
-        frame_rate_hz=rate_hz,
-        relative=bytes([1, 0]),
-        rest_q15=halves([STILL, 100]),
-        limit_low_q15=halves([0, 0]),
-        limit_high_q15=halves([ONE, ONE]),
-        pulse0_q4us=halves([0, 0]),
-        pulse1_q4us=halves([0, 0]),
-    )
-    motor = MOTOR.Motor(types.SimpleNamespace(quiet=lambda: None), tables)
-    motor.load(tables)
-    signal = halves([ONE, 20_000])
-    speeds = []
-    for frame in range(rate_hz):
-        motor.move(signal, frame > 0)
-        speeds.append(motor.motor_q15[0] - STILL)
-        assert motor.motor_q15[1] == 20_000
-    frames = math.ceil(Fraction(3, 10) * rate_hz)
-    assert speeds[0] == STILL and speeds[frames] == 0 and speeds == sorted(speeds, reverse=True)
-    assert max(a - b for a, b in itertools.pairwise(speeds)) <= STILL / (0.3 * rate_hz) + 2
-    motor.move(signal, False)
-    assert 0 < motor.motor_q15[0] - STILL <= STILL / (0.3 * rate_hz) + 2
-
-
-class Peripheral:
-    """The PWM block's registers; stands in for the cast of an address to `ptr32`."""
-
-    def __init__(self):
-        self.slices = [array("i", [0] * (SLICE_BYTES // 4)) for _ in range(8)]
-
-    def __call__(self, address):
-        number, rest = divmod(address - PWM_ADDRESS, SLICE_BYTES)
-        assert rest == 0 and 0 <= number < 8, f"{address:#x} is no slice"
-        return Pointer(self.slices[number], 32)
-
-    def compare(self, pin):
-        """Return the compare value of a pin's channel: A, the even pin's, is the lower half."""
-        return self.slices[pin // 2 % 8][CC] >> (16 if pin % 2 else 0) & 0xFFFF
-
-
 @pytest.fixture
-def pwm():
-    BOARD.ptr32 = Peripheral()
+def memory():
+    return fresh_memory()
+
+
+def fresh_memory():
+    """Put memory that is all 0 under the kernels, as one property test needs it for each example."""
+    BOARD.ptr32 = Memory()
     return BOARD.ptr32
 
 
-@given(widths=st.lists(pulses_q4us, min_size=16, max_size=16), first=st.integers(0, 12))
-def test_board_sets_every_channel_to_its_pulse_within_half_a_count(widths, first):
-    pwm = BOARD.ptr32 = Peripheral()
+def uses(of):
+    """Return the bytes that say what each pin does."""
+    return bytearray(of.get(pin, OFF) for pin in range(30))
+
+
+@pytest.mark.parametrize("pin", PINS)
+def test_slice_starts_with_both_outputs_low_and_stands_while_it_is_set(memory, pin):
+    memory.word[slice_of(pin) + CC] = 0x12345678
+    BOARD._start_slice(pin >> 1 & 7, 640, 62500, 41)
+    assert memory.written[0] == (slice_of(pin) + CSR, 0)
+    assert memory.written[-1] == (slice_of(pin) + CSR, 1)
+    found = {offset: memory.word[slice_of(pin) + offset] for offset in (DIV, CTR, CC, TOP)}
+    assert found == {DIV: 640, CTR: 41, CC: 0, TOP: 62499}
+    assert len(memory.written) == 6
+
+
+@given(widths=st.lists(pulses_q18us, min_size=16, max_size=16), first=st.integers(0, 12))
+def test_pulses_are_set_within_half_a_count_on_every_channel(widths, first):
+    memory = fresh_memory()
     pins = [*range(first, first + 16)]
-    attached = bytearray([1] * 29)
-    BOARD._pulses(16, bytes(pins), attached, halves(widths))
-    for pin, width_q4us in zip(pins, widths, strict=True):
-        counts = Fraction(width_q4us, 16) * Fraction(125, 40)  # 125 MHz divided by 40
-        assert pwm.compare(pin) == rounded(counts)
+    for pin in pins:
+        memory.word[slice_of(pin) + TOP] = 62499
+    BOARD._pulses(16, bytes(pins), 0xFFFF, words(widths), uses(dict.fromkeys(pins, PULSES)))
+    for pin, width in zip(pins, widths, strict=True):
+        assert memory.compare(pin) == rounded(Fraction(width, 1 << 18) / SERVO_COUNT_US)
 
 
-def test_board_touches_attached_pins_alone(pwm):
-    attached = bytearray(29)
-    attached[3] = 1
-    BOARD._pulses(4, bytes([2, 3, formats.NO_PIN, 28]), attached, halves([16_000] * 4))
-    assert [pwm.compare(pin) for pin in range(16)] == [0, 0, 0, 3125, *[0] * 12]
+@given(pulses_q18us, periods_us)
+def test_pulse_leaves_200_us_of_its_period_low(width, period_us):
+    memory = fresh_memory()
+    counts = Fraction(period_us) / SERVO_COUNT_US
+    assert counts.denominator == 1
+    memory.word[slice_of(3) + TOP] = int(counts) - 1
+    BOARD._pulses(1, bytes([3]), 1, words([width]), uses({3: PULSES}))
+    assert memory.compare(3) <= counts - 625
+    if width >> 18 <= period_us - 201:
+        assert memory.compare(3) == rounded(Fraction(width, 1 << 18) / SERVO_COUNT_US)
 
 
-def test_board_starts_a_slice_with_a_period_of_20_ms_and_both_outputs_low(pwm):
-    pwm.slices[5][CC] = 77
-    BOARD._start_slice((PWM_ADDRESS >> 2) + 5 * SLICE_BYTES // 4)
-    enabled, divider_q4, _, compare, top = pwm.slices[5]
-    assert (enabled, compare) == (1, 0)
-    assert Fraction(divider_q4, 16) * (top + 1) / 125_000_000 == Fraction(formats.SERVO_PERIOD_US, 1_000_000)
+def test_pulses_touch_only_what_is_due_attached_and_in_use(memory):
+    pins = bytes([2, 3, formats.NO_PIN, 28, 20])
+    for pin in (2, 3, 28, 20):
+        memory.word[slice_of(pin) + TOP] = 62499
+    use = uses({2: PULSES, 3: PULSES, 28: OFF, 20: PULSES})
+    BOARD._pulses(5, pins, 0b01110, words([1000 << 18] * 5), use)
+    assert [pin for pin in PINS if memory.compare(pin)] == [3, 19], "3 and 19 are one channel"
+    assert {address for address, _ in memory.written} == {slice_of(3) + CC}
 
 
-@pytest.mark.parametrize("upper", [0, 1])
-def test_board_compares_one_channel_and_leaves_the_other(pwm, upper):
-    address = (PWM_ADDRESS >> 2) + 2 * SLICE_BYTES // 4
-    BOARD._compare(address, 0, 9375)
-    BOARD._compare(address, 1, 938)
-    BOARD._compare(address, upper, 5)
-    assert [pwm.compare(4), pwm.compare(5)] == ([9375, 5] if upper else [5, 938])
+@pytest.mark.parametrize("pin", [4, 5])
+def test_pulse_leaves_the_other_channel_of_its_slice_alone(memory, pin):
+    memory.word[slice_of(4) + TOP] = 62499
+    memory.word[slice_of(4) + CC] = 0xFFFF8001
+    BOARD._pulses(1, bytes([pin]), 1, words([1000 << 18]), uses({pin: PULSES}))
+    assert [memory.compare(4), memory.compare(5)] == ([3125, 0xFFFF] if pin == 4 else [0x8001, 3125])
+
+
+@pytest.mark.parametrize("kernel", ["_pulses", "_compare"])
+def test_pin_is_connected_by_the_write_after_its_channel_was_cleared(memory, kernel):
+    memory.word[slice_of(7) + TOP] = 62499
+    use = uses({7: CLEARS})
+    seen = []
+    for _ in range(3):
+        if kernel == "_pulses":
+            BOARD._pulses(1, bytes([7]), 1, words([1000 << 18]), use)
+        else:
+            BOARD._compare(7, 32768, use)
+        seen.append((use[7], memory.compare(7), memory.function(7)))
+    assert seen == [(CONNECTS, 0, 0), (PULSES, 3125, FUNCTION_PWM), (PULSES, 3125, FUNCTION_PWM)]
+    assert memory.written[0][0] == slice_of(7) + CC, "the width is set before the pin is connected"
+
+
+def test_compare_leaves_the_other_channel_and_unused_pins_alone(memory):
+    memory.word[slice_of(8) + CC] = 0xFFFF8001
+    BOARD._compare(9, 65536, uses({9: PULSES}))
+    assert [memory.compare(8), memory.compare(9)] == [0x8001, 6250]
+    BOARD._compare(8, 17, uses({9: PULSES}))
+    assert memory.compare(8) == 0x8001
+
+
+@given(integers(0, 65536))
+def test_compare_gives_the_nearest_part_of_50_us(duty_q16):
+    memory = fresh_memory()
+    BOARD._compare(9, duty_q16, uses({9: PULSES}))
+    assert memory.compare(9) == rounded(Fraction(duty_q16 * 6250, 65536))
+
+
+@pytest.mark.parametrize("pin", PINS)
+def test_clearing_a_channel_leaves_the_other_alone(memory, pin):
+    memory.word[slice_of(pin) + CC] = 0xABCDEF01
+    BOARD._clear(pin)
+    assert memory.word[slice_of(pin) + CC] == (0x0000EF01 if pin % 2 else 0xABCD0000)
+    assert memory.written[0][0] == slice_of(pin) + CC + CLEAR, "in one store, whatever an interrupt writes meanwhile"
+
+
+@pytest.mark.parametrize("pin", PINS)
+@pytest.mark.parametrize("level", [0, 1])
+def test_pin_has_its_level_before_it_drives(memory, pin, level):
+    BOARD._drive(pin, level)
+    assert memory.written == [
+        (GPIO_OUT_SET if level else GPIO_OUT_CLR, 1 << pin),
+        (GPIO_OE_SET, 1 << pin),
+        (PADS_BANK0 + 4 * pin + 4, PAD_AFTER_RESET),
+        (IO_BANK0 + 8 * pin + 4, FUNCTION_SIO),
+    ]
+
+
+@given(st.dictionaries(pins, st.sampled_from([PULSES, CONNECTS, CLEARS])))
+def test_quiet_drives_all_pins_in_use_low_and_no_other(of):
+    memory = fresh_memory()
+    for number in range(8):
+        memory.word[PWM + SLICE_BYTES * number + CC] = 0xFFFFFFFF
+    use = uses(of)
+    BOARD._quiet(30, use)
+    assert not any(use)
+    lowered = {bit.bit_length() - 1 for address, bit in memory.written if address == GPIO_OUT_CLR}
+    driving = {bit.bit_length() - 1 for address, bit in memory.written if address == GPIO_OE_SET}
+    assert lowered == driving == set(of) == {pin for pin in PINS if memory.function(pin) == FUNCTION_SIO}
+    cleared = {pin % 16 for pin in of}
+    assert {pin for pin in range(16) if memory.compare(pin) == 0} == cleared
+
+
+@pytest.mark.parametrize("pin", [0, 15, 28])
+def test_level_is_that_of_the_pin(memory, pin):
+    memory.word[GPIO_IN] = 1 << pin | 1 << 31
+    assert BOARD._level(pin) == 1
+    memory.word[GPIO_IN] ^= 0x3FFFFFFF
+    assert BOARD._level(pin) == 0
+
+
+@pytest.mark.parametrize(("pin", "channel"), [(26, 0), (27, 1), (28, 2)])
+def test_conversion_takes_the_pin_from_everything_digital(memory, pin, channel):
+    BOARD._convert(pin)
+    assert memory.function(pin) == FUNCTION_NULL
+    pad = memory.word[PADS_BANK0 + 4 + 4 * pin]
+    input_enable, pulls, output_disable = pad >> 6 & 1, pad >> 2 & 3, pad >> 7
+    assert (input_enable, pulls, output_disable) == (0, 0, 1)
+    assert memory.written[-1] == (ADC, channel << 12 | 1 << 2 | 1)  # AINSEL, START_ONCE, EN
+
+
+def test_conversion_gives_ratios_to_the_nearest(memory):
+    for raw in range(4096):
+        memory.word[ADC + 4] = raw
+        assert abs(BOARD._converted() - Fraction(raw * 32768, 4095)) <= Fraction(1, 2) + Fraction(1, 500)
+    assert BOARD._converted() == formats.VALUE_ONE
+
+
+@given(integers(0, (1 << 30) - 1), integers(0, 1 << 29))
+def test_instants_follow_each_other_modulo_2_to_the_30(ticks_us, us):
+    assert BOARD._later(ticks_us, us) == (ticks_us + us) % (1 << 30)
+
+
+def test_alarm_is_that_of_the_fourth_comparator_modulo_2_to_the_30(memory):
+    memory.word[TIMER_ALARM3] = 0xC0000123
+    assert BOARD._alarm_us() == 0x123
+
+
+def test_watchdog_is_off_while_it_is_set_and_then_resets_all_but_the_oscillators(memory):
+    memory.word[WATCHDOG] = 0xFFFFFFFF
+    memory.word[WATCHDOG + 0x1C] = 0xB007C0D3
+    BOARD._guard(1, 2_000_000)
+    enable = 1 << 30
+    assert memory.written[0] == (WATCHDOG + CLEAR, enable)
+    assert memory.written[-1] == (WATCHDOG + SET, enable)
+    assert memory.word[PSM_WDSEL] == 0x1FFFF & ~0b11
+    assert memory.word[WATCHDOG + 4] == 2_000_000
+    assert memory.word[WATCHDOG + 0x1C] == 0, "the boot ROM finds no address to go to"
+    BOARD._guard(0, 0)
+    assert memory.word[WATCHDOG] == 0xFFFFFFFF & ~enable
+
+
+def test_watchdog_is_fed_by_its_load_register(memory):
+    BOARD._feed(0xFFFFFF)
+    assert memory.written == [(WATCHDOG + 4, 0xFFFFFF)]
+
+
+@pytest.mark.parametrize(("reason", "bitten"), [(0, 0), (1, 1), (2, 0), (3, 1)])
+def test_watchdog_tells_whether_its_time_ran_out(memory, reason, bitten):
+    memory.word[WATCHDOG + 8] = reason
+    assert BOARD._bitten() == bitten
+
+
+@given(st.integers(0, 18), integers(0, 0xFFFF), st.integers(0, 31))
+def test_kept_words_find_every_damaged_bit(place, value, bit):
+    memory = fresh_memory()
+    BOARD._keep(place, value)
+    assert BOARD._kept(place) == value
+    memory.word[KEPT + 4 * place] ^= 1 << bit
+    assert BOARD._kept(place) == -1
+
+
+def test_memory_as_it_comes_up_holds_no_kept_words(memory):
+    for content in (0, 0xFFFFFFFF):
+        memory.word[KEPT] = content
+        assert BOARD._kept(0) == -1
+
+
+@given(st.lists(integers(0, 1 << 24, 255, 256), min_size=1, max_size=16), integers(1, (1 << 30) - 1))
+def test_pose_is_kept_to_the_nearest_q15_under_its_tag(positions_q24, tag):
+    memory = fresh_memory()
+    BOARD._keep_pose(len(positions_q24), words(positions_q24), tag)
+    assert BOARD._tag() == tag
+    kept = [BOARD._kept(1 + d) for d in range(len(positions_q24))]
+    assert kept == [rounded(Fraction(position, 512)) for position in positions_q24]
+    assert {address for address, _ in memory.written} <= {KEPT + 4 * place for place in range(17)}
+
+
+def test_pose_of_another_wiring_has_no_tag_while_it_is_overwritten(memory):
+    BOARD._keep_pose(2, words([0, 1 << 24]), 7)
+    memory.written.clear()
+    BOARD._keep_pose(2, words([1 << 24, 0]), 8)
+    assert memory.written[0] == (KEPT, 0) and memory.written[-1] == (KEPT, 8)

@@ -125,15 +125,15 @@ def test_link_repeats_all_that_follow_a_lost_command_in_their_order():
     def script(number, message_id, seq):
         if number == 1:
             return b"", DELAY_US  # lost on the way
-        if 1 < number < 5:
+        if 1 < number < WINDOW:
             return ack(seq, messages.RESEND, 1), DELAY_US
         return ack(seq), DELAY_US
 
     link, carrier, _ = link_to(script)
-    for _ in range(5):
+    for _ in range(WINDOW):
         link.post("ping")
     waited_us = settle(link)
-    assert [seq for _, seq, _ in carrier.arrived] == [0, 1, 2, 3, 4, 1, 2, 3, 4]
+    assert [seq for _, seq, _ in carrier.arrived] == [*range(WINDOW), *range(1, WINDOW)]
     assert waited_us < RETRY_US / 2, "a gap that the MCU reports is filled at once"
 
 
@@ -143,16 +143,16 @@ def test_link_hurries_once_for_all_that_report_a_gap():
             (b"", 0)
             if number == 0
             else (ack(seq, messages.RESEND, 0), DELAY_US)
-            if number < 8
+            if number < WINDOW
             else (ack(seq), DELAY_US)
         )
 
     link, carrier, _ = link_to(script)
-    for _ in range(8):
+    for _ in range(WINDOW):
         link.post("ping")
     settle(link)
-    assert [seq for _, seq, _ in carrier.arrived] == [*range(8), *range(8)]
-    assert carrier.arrived[8][2] - carrier.arrived[0][2] >= min(DELAY_US, HURRY_US)
+    assert [seq for _, seq, _ in carrier.arrived] == [*range(WINDOW), *range(WINDOW)]
+    assert carrier.arrived[WINDOW][2] - carrier.arrived[0][2] >= min(DELAY_US, HURRY_US)
 
 
 @pytest.mark.parametrize(
@@ -312,4 +312,4 @@ def test_session_splits_targets_into_messages_that_fit():
     session = Session(carrier)
     session.weight_targets(9, {action: action << 20 for action in range(64)})
     session.flush()
-    assert [message_id for message_id, _, _ in carrier.arrived] == [messages.WEIGHT_TARGETS] * 2
+    assert [message_id for message_id, _, _ in carrier.arrived] == [messages.WEIGHT_TARGETS] * 5

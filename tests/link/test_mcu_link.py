@@ -36,9 +36,10 @@ def wide_tables():
         "seed": 9,
         "noise_spread_q15": 0,
     }
-    yield "begin", {**begin, "hold_q26": 1 << 20, "link_timeout_ms": 500}, []
+    yield "begin", {**begin, "hold_q26": 1 << 20, "link_timeout_ms": 500, "when_silent": 0}, []
+    yield "robot", GOOD["robot"], []
     for dof in range(16):
-        yield "dof", {"dof": dof, "kind": 0, "rest_q15": 16384, "low_q15": 0, "high_q15": 32768}, []
+        yield "dof", GOOD["dof"] | {"dof": dof, "rest_q15": 16384}, []
     for action in range(64):
         fields = {"action": action, "tempo_q16": 65536, "rise_q26": 1 << 22, "fall_q26": 1 << 22}
         fields |= {"first_mapping": 8 * action, "mappings": 8, "entry": 0, "warp_q26": 1 << 22, "cycles": 0}
@@ -156,7 +157,7 @@ def test_other_version_is_refused_with_both_numbers(mcu, monkeypatch, protocol, 
     monkeypatch.setattr(messages, "PROTOCOL", protocol)
     with pytest.raises(LinkForeign) as refusal:
         Session(VirtualCarrier(mcu)).open()
-    assert f"the firmware speaks protocol 1, dictionary {DICTIONARY:08x}" in str(refusal.value)
+    assert f"the firmware speaks protocol 2, dictionary {DICTIONARY:08x}" in str(refusal.value)
     assert f"this program speaks protocol {protocol}, dictionary {dictionary:08x}" in str(refusal.value)
 
 
@@ -196,9 +197,49 @@ GOOD = {
         "noise_spread_q15": 0,
         "hold_q26": 1 << 20,
         "link_timeout_ms": 500,
+        "when_silent": 2,
     },
-    "dof": {"dof": 0, "kind": 0, "rest_q15": 0, "low_q15": 0, "high_q15": 32768},
-    "output": {"dof": 0, "pin": 2, "pulse0_q4us": 16000, "pulse1_q4us": 32000},
+    "robot": {"motor_period_us": 20000, "attach_ms": 2000, "kill_pin": 22, "kill_level": 1, "autostart": 1},
+    "device": {"device": 3, "driver": formats.DRIVER_PCA9685},
+    "dof": {
+        "dof": 0,
+        "kind": 0,
+        "rest_q15": 0,
+        "low_q15": 0,
+        "high_q15": 32768,
+        "speed_q24": 1 << 24,
+        "accel_q24": 1 << 24,
+    },
+    "character": {
+        "dof": 0,
+        "position_error_q24": 1 << 28,
+        "position_rate_q24": -1 << 28,
+        "position_slope_q24": 0,
+        "rate_error_q24": 0,
+        "rate_rate_q24": 0,
+        "rate_slope_q24": 0,
+    },
+    "output": {
+        "dof": 0,
+        "driver": formats.DRIVER_PINS,
+        "turns": 1,
+        "end0_q4us": 4800,
+        "end1_q4us": 48000,
+        "dead_q15": 0,
+        "top_q15": 32768,
+    },
+    "feedback": {
+        "dof": 0,
+        "pin": 28,
+        "at0_q15": 32768,
+        "at1_q15": 32256,
+        "gain_q15": 32768,
+        "integral_q24": 1 << 24,
+        "most_q15": 32768,
+        "stall_q15": 32768,
+        "stall_ticks": 65535,
+    },
+    "guard": {"dof": 0, "release_ms": 65535, "duty_q15": 16384, "window_s": 1},
     "action": {
         "action": 0,
         "tempo_q16": 65536,
@@ -218,6 +259,8 @@ GOOD = {
     "keep": {"kind": 0, "first": 0},
 }
 ITEMS = {
+    "device": [{"setting": setting} for setting in (4, 5, 0x40, 6, 400, 25000)],
+    "output": [{"setting": 2}],
     "curve": [{"value_q15": 0}, {"value_q15": 32768}],
     "program": [{"word": 0}, {"word": -65536}],
     "keep": [{"old": formats.NEW}],
@@ -231,13 +274,32 @@ BAD_FIELDS = [
     *(("begin", name, value) for name, value in [("curves", 65), ("blinks", 129)]),
     *(("begin", name, value) for name, value in [("noise_spread_q15", 32769), ("hold_q26", 0), ("hold_q26", 1 << 26)]),
     *(("begin", name, value) for name, value in [("link_timeout_ms", 99), ("link_timeout_ms", 60001)]),
+    ("begin", "when_silent", 3),
+    *(("robot", "motor_period_us", value) for value in (0, 3000, 3012, 19999, 20008, 65535)),
+    *(("robot", "kill_pin", value) for value in (0, 1, 23, 24, 25, 29, 254)),
+    *(("robot", name, value) for name, value in [("attach_ms", 2001), ("kill_level", 2), ("autostart", 2)]),
+    *(("device", name, value) for name, value in [("device", 4), ("device", 255), ("driver", 3), ("driver", 255)]),
     *(("dof", name, value) for name, value in [("dof", 1), ("dof", 255), ("kind", 2), ("rest_q15", 32769)]),
     *(("dof", name, value) for name, value in [("high_q15", 32769), ("low_q15", 32769), ("low_q15", 65535)]),
-    *(("output", name, value) for name, value in [("dof", 1), ("pin", 0), ("pin", 1), ("pin", 23), ("pin", 255)]),
+    *(("dof", name, value) for name in ("speed_q24", "accel_q24") for value in (0, (1 << 24) + 1, 0xFFFFFFFF)),
+    ("dof", "accel_q24", 1),
+    *(("character", "dof", value) for value in (1, 255)),
     *(
-        ("output", name, value)
-        for name, value in [("pulse0_q4us", 4799), ("pulse1_q4us", 48001), ("pulse0_q4us", 65535)]
+        ("character", name, value)
+        for name in GOOD["character"]
+        if name != "dof"
+        for value in ((1 << 28) + 1, (-1 << 28) - 1, 0x7FFFFFFF, -0x80000000)
     ),
+    *(("output", name, value) for name, value in [("dof", 1), ("dof", 255), ("driver", 3), ("driver", 255)]),
+    *(("output", name, value) for name, value in [("turns", 0), ("turns", 2), ("turns", 255)]),
+    *(("output", name, value) for name in ("end0_q4us", "end1_q4us") for value in (0, 4799, 48001, 65535)),
+    *(("output", name, value) for name, value in [("dead_q15", 32768), ("dead_q15", 65535), ("top_q15", 32769)]),
+    *(("feedback", name, value) for name, value in [("dof", 1), ("dof", 255), ("pin", 2), ("pin", 25), ("pin", 29)]),
+    *(("feedback", name, 32769) for name in ("at0_q15", "at1_q15", "gain_q15", "most_q15", "stall_q15")),
+    *(("feedback", name, value) for name, value in [("at1_q15", 32257), ("at1_q15", 32768)]),
+    *(("feedback", "integral_q24", value) for value in ((1 << 24) + 1, 0xFFFFFFFF)),
+    *(("guard", name, value) for name, value in [("dof", 1), ("dof", 255), ("duty_q15", 0), ("duty_q15", 32769)]),
+    ("guard", "window_s", 0),
     *(
         ("action", name, value)
         for name, value in [("action", 1), ("action", 255), ("tempo_q16", 3276), ("tempo_q16", 0)]
@@ -339,7 +401,7 @@ def test_bad_tables_leave_those_that_are_loaded(loaded):
     session, first_taps = loaded
     parts = list(pet_tables().messages())
     for number, (name, _, _) in enumerate(parts[:-1]):
-        if name != "output":  # which a DOF may lack
+        if name not in ("output", "character", "feedback", "guard"):  # which a DOF may lack
             with pytest.raises(LinkRefused):
                 session.upload(Parts(parts[:number] + parts[number + 1 :]))
             assert play(session) == first_taps, name
@@ -349,10 +411,10 @@ def test_tables_with_an_output_refused_leave_those_that_are_loaded(loaded):
     session, first_taps = loaded
     parts = list(pet_tables().messages())
     pins = [number for number, (name, _, _) in enumerate(parts) if name == "output"]
-    clash = ("output", parts[pins[1]][1] | {"pin": parts[pins[0]][1]["pin"] + 16}, [])
+    clash = ("output", parts[pins[1]][1], [{"setting": parts[pins[0]][2][0]["setting"] + 16}])
     with pytest.raises(LinkRefused, match="refused 'output': a field is out of range") as refusal:
         session.upload(Parts([*parts[: pins[1]], clash, *parts[pins[1] + 1 :]]))
-    assert (refusal.value.status, refusal.value.detail) == (messages.RANGE, 1)
+    assert (refusal.value.status, refusal.value.detail) == (messages.RANGE, 7)
     assert refused(session, "commit")[0] == messages.STATE
     assert play(session) == first_taps
 
@@ -366,6 +428,12 @@ def test_tables_with_an_output_refused_leave_those_that_are_loaded(loaded):
         ("program", [{"word": 6}, {"word": 6}], 3),
         ("program", [{"word": 0}] * 3, 4),
         ("keep", [{"old": formats.NEW}] * 2, 1),
+        ("device", [{"setting": 1}] * 9, 10),
+        ("device", [{"setting": setting} for setting in (4, 5, 0x3F, 6, 400, 25000)], 4),
+        ("output", [{"setting": 2}] * 7, 13),
+        ("output", [{"setting": 2}] * 2, 8),
+        ("output", [], 7),
+        *(("output", [{"setting": pin}], 7) for pin in (0, 1, 6, 22, 23, 255, 65535)),
     ],
 )
 def test_part_with_a_bad_item_is_refused(loaded, name, items, detail):
@@ -377,11 +445,14 @@ def test_part_with_a_bad_item_is_refused(loaded, name, items, detail):
     assert play(session) == first_taps
 
 
-def test_tables_of_another_frame_rate_are_not_exchanged_while_the_motion_runs(mcu):
+@pytest.mark.parametrize(
+    ("part", "field", "value"), [("begin", "frame_rate_hz", 31), ("robot", "motor_period_us", 10000)]
+)
+def test_tables_of_another_rate_are_not_exchanged_while_the_motion_runs(mcu, part, field, value):
     session = begin_performance(mcu)
-    (_, begin, _), *parts, _ = wide_tables()
-    for name, fields, items in [("begin", begin | {"frame_rate_hz": 31}, []), *parts]:
-        assert refused(session, name, fields, items) is None
+    *parts, _ = wide_tables()
+    for name, fields, items in parts:
+        assert refused(session, name, fields | {field: value} if name == part else fields, items) is None
     assert refused(session, "commit") == (messages.STATE, 0)
     with UnixMcu() as other:
         calm = begin_performance(other)
@@ -393,8 +464,9 @@ def test_tables_of_another_frame_rate_are_not_exchanged_while_the_motion_runs(mc
 
 def test_commands_that_the_state_forbids_are_refused(mcu):
     session = open_session(VirtualCarrier(mcu))
-    for name in ("start", "arm", "commit", "dof", "output", "action", "live", "curve", "program", "blink", "keep"):
-        fields = GOOD.get(name, {})
+    names = ["start", "arm", "commit", "calibrate", "limit", *GOOD, "save_end"]
+    for name in [name for name in names if name not in ("begin", "mapping")]:
+        fields = (GOOD | LIVE).get(name, {})
         assert refused(session, name, fields)[0] == messages.STATE, name
     assert refused(session, "mappings", {"first_mapping": 0}, [GOOD["mapping"]])[0] == messages.STATE
     assert session.status()["frame"] == -1
@@ -417,6 +489,53 @@ def test_message_of_a_wrong_length_or_id_is_refused_and_changes_nothing(loaded):
         assert raw(session, message_id, bytes(5)) == (messages.UNKNOWN, message_id)
     session.open()
     assert play(session) == first_taps
+
+
+LIVE = {
+    "calibrate": {"dof": 0, "end0_q4us": 4800, "end1_q4us": 48000, "dead_q15": 0, "top_q15": 32768},
+    "limit": {"dof": 0, "low_q15": 0, "high_q15": 32768, "speed_q24": 1 << 24, "accel_q24": 1 << 24},
+}
+BAD_LIVE = [
+    *(("calibrate", "dof", value) for value in (1, 16, 255)),
+    *(("calibrate", name, value) for name in ("end0_q4us", "end1_q4us") for value in (0, 4799, 48001, 65535)),
+    *(("calibrate", name, value) for name, value in [("dead_q15", 32768), ("top_q15", 32769), ("top_q15", 65535)]),
+    *(("limit", "dof", value) for value in (2, 16, 255)),
+    *(("limit", name, value) for name, value in [("low_q15", 32769), ("high_q15", 32769), ("high_q15", 65535)]),
+    *(("limit", "speed_q24", value) for value in (0, (1 << 24) + 1, 0x3FFFFFFF, 0x40000000, 0xFFFFFFFF)),
+    *(("limit", "accel_q24", value) for value in (0, 1, (1 << 24) + 1, 0x40000000, 0xFFFFFFFF)),
+]
+
+
+def two_dofs():
+    """A puppet of two DOFs, of which the first has an output."""
+    yield "begin", GOOD["begin"] | {"actions": 0, "mappings": 0} | dict.fromkeys(PARTS_LEFT_OUT, 0), []
+    yield "robot", GOOD["robot"] | {"kill_pin": formats.NO_PIN, "autostart": 0}, []
+    for dof in range(2):
+        yield "dof", GOOD["dof"] | {"dof": dof}, []
+    yield "output", GOOD["output"], ITEMS["output"]
+    yield "commit", {}, []
+
+
+PARTS_LEFT_OUT = ("lives", "curves", "programs", "blinks")
+
+
+@pytest.mark.parametrize(("name", "field", "value"), BAD_LIVE)
+def test_change_of_what_plays_is_refused_if_a_field_is_out_of_range(mcu, name, field, value):
+    session = open_session(VirtualCarrier(mcu))
+    session.upload(Parts(two_dofs()))
+    assert refused(session, name, LIVE[name]) is None
+    assert refused(session, name, LIVE[name] | {field: value}) == (messages.RANGE, list(LIVE[name]).index(field))
+    assert refused(session, name, LIVE[name]) is None, "and nothing else is"
+
+
+def test_change_of_what_plays_leaves_tables_that_are_being_filled(mcu):
+    session = open_session(VirtualCarrier(mcu))
+    *parts, commit = two_dofs()
+    session.upload(Parts([*parts, commit]))
+    for part in parts:
+        assert refused(session, *part) is None
+    assert refused(session, "limit", LIVE["limit"] | {"accel_q24": 0}) == (messages.RANGE, 4)
+    assert refused(session, *commit) is None
 
 
 def raw(session, message_id, payload):
@@ -455,5 +574,5 @@ def raw(session, message_id, payload):
 def test_targets_out_of_range_are_refused_whole(loaded, name, frame, items, detail):
     session, first_taps = loaded
     assert refused(session, name, {"frame": frame}, items) == (messages.RANGE, detail)
-    assert refused(session, "telemetry", {"taps": 8, "taps_every": 1, "weights_every": 1}) == (messages.RANGE, 0)
+    assert refused(session, "telemetry", {"taps": 16, "taps_every": 1, "weights_every": 1}) == (messages.RANGE, 0)
     assert play(session) == first_taps

@@ -11,7 +11,7 @@ from marotte.session import DICTIONARY
 from shared import codec, messages
 
 RANGES = {"B": (0, 0xFF), "H": (0, 0xFFFF), "I": (0, 0xFFFFFFFF), "i": (-0x80000000, 0x7FFFFFFF)}
-SUFFIXES = ("_q12", "_q15", "_q16", "_q18", "_q26", "_q28", "_hz", "_ms", "_us", "_q4us")
+SUFFIXES = ("_q12", "_q15", "_q16", "_q18", "_q24", "_q26", "_q28", "_hz", "_s", "_ms", "_us", "_q4us")
 COUNTS = {
     *("protocol", "dictionary", "seed", "seq", "status", "detail", "frame", "armed", "silent"),
     *(
@@ -30,7 +30,10 @@ COUNTS = {
     ),
     *("curve", "curves", "samples", "program", "programs", "words", "word", "blink", "blinks", "entry", "cycles"),
     *("first", "old"),
-    *("pulse0_q4us", "pulse1_q4us", "taps", "taps_every", "weights_every", "packets", "damaged"),
+    *("taps", "taps_every", "weights_every", "packets", "damaged", "when_silent"),
+    *("kill_pin", "kill_level", "autostart", "device", "driver", "setting", "turns", "stall_ticks"),
+    *("ticks", "attached", "released", "stalled", "killed_by", "bus_errors", "bus_gone", "resets", "store"),
+    *("bytes", "crc32", "place", "byte"),
     *("dofs_max", "actions_max", "mappings_max", "lives_max", "queue_max", "late_frames", "late_targets", "heap_free"),
 }
 """Counts, indices, flags and bit sets: what has no unit."""
@@ -136,7 +139,7 @@ def test_dictionary_entry_is_well_formed(message):
 
 def test_status_codes_have_their_texts_in_order():
     codes = [messages.OK, messages.RESEND, messages.MISMATCH, messages.UNKNOWN, messages.LENGTH, messages.RANGE]
-    codes += [messages.INCOMPLETE, messages.STATE, messages.FULL]
+    codes += [messages.INCOMPLETE, messages.STATE, messages.FULL, messages.FLASH]
     assert codes == list(range(len(messages.STATUS_TEXT)))
 
 
@@ -146,7 +149,7 @@ def test_dictionary_checksum_changes_with_the_layout(monkeypatch, change):
     changed = {
         "id": (name, message_id + 64, fields, items),
         "name": ("dofs", message_id, fields, items),
-        "type": (name, message_id, (*fields[:-1], (fields[-1][0], "I")), items),
+        "type": (name, message_id, (*fields[:-1], (fields[-1][0], "i")), items),
         "field": (name, message_id, fields[:-1], items),
         "order": (name, message_id, (fields[1], fields[0], *fields[2:]), items),
     }[change]

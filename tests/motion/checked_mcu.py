@@ -1,123 +1,130 @@
-"""The firmware under CPython as an emulated MCU, with every integer of kernels and of per-frame code checked."""
+"""The firmware under CPython as an emulated MCU, with every integer of kernels and of what runs per frame and tick checked.
 
-from collections import deque
+It is the PC's emulated MCU, with another process: a thread that runs the virtual board and the main loop in checked integers.
+"""
 
-from marotte.mcu.base import VirtualMcu
+import io
+import os
+import threading
+import types
+
+from marotte.mcu.unix import UnixMcu
+from marotte.mcu.unix_process import UnixProcess
 from tests.checked import load_checked
 
 TICKS_MODULUS = 1 << 30
+
+
+def methods(name, *functions):
+    """Return the full names of a class's methods."""
+    return [f"{name}.{function}" for function in functions]
+
+
+# fmt: off
 SMALL_INT_FUNCTIONS = (
-    "ticks_diff",
-    *(f"FrameClock.{name}" for name in ("start", "until_us", "begin")),
-    *(f"Cues.{name}" for name in ("clear", "put", "apply", "renumber")),
-    *(
-        f"Actions.{name}"
-        for name in (
-            "compute_phases",
-            "follow_tempos",
-            "end_gestures",
-            "enter",
-            "warp",
-            "_phases",
-            "_nominal",
-            "_place",
-        )
+    "ticks_diff", "seal", "is_sealed",
+    *methods("FrameClock", "start", "until_us", "begin"),
+    *methods("Cues", "clear", "put", "apply", "renumber"),
+    *methods(
+        "Actions", "compute_phases", "follow_tempos", "end_gestures", "enter", "warp", "_phases", "_nominal", "_place"
     ),
-    *(f"Blinks.{name}" for name in ("enter", "evaluate", "exchange")),
-    "Programs.evaluate",
-    *(f"Exchange.{name}" for name in ("carry_over", "_swap")),
-    *(f"Motor.{name}" for name in ("load", "move", "stand", "arm", "kill", "_write")),
-    *(f"Puppet.{name}" for name in ("start", "stop", "prepare", "step", "_synthesise", "_rest")),
-    *(
-        f"Link.{name}"
-        for name in ("poll", "_packet", "_carry_out", "_queue", "report", "_pack_frame", "_answer", "_send")
+    *methods("Blinks", "enter", "evaluate", "exchange"),
+    *methods("Programs", "evaluate"),
+    *methods("Exchange", "carry_over", "_swap"),
+    *methods("Puppet", "start", "stop", "prepare", "step", "_synthesise", "_rest"),
+    *methods(
+        "Motor", "exchange", "start", "stand", "put", "heard", "arm", "kill", "limit", "attach", "detach", "derive",
+        "attend", "_rearrange", "_tick", "_step", "_tap", "_stand", "_hold_unattached",
     ),
-    *(f"Link._on_{name}" for name in ("weight_targets", "live_targets", "tempo", "telemetry", "start", "stop", "ping")),
-    "seal",
-    "is_sealed",
+    *methods("Ring", "put", "rearrange"),
+    *methods(
+        "Trajectory", "hold", "stand_one", "prepare", "start", "put", "rearrange", "advance", "derive", "_next"
+    ),
+    *methods("Character", "stand", "rearrange", "respond"),
+    *methods("Feedback", "pause", "tick", "_begin", "measured", "start", "forgive"),
+    *methods(
+        "Guards", "arm", "disarm", "attend", "_outputs", "_kept", "_queue", "_attach_next", "_attach", "_detach"
+    ),
+    *methods("Drivers", "attach", "release", "write", "flush", "quiet", "attend"),
+    *methods("PinsDriver", "attach", "release", "write", "quiet"),
+    *methods("BridgeDriver", "attach", "release", "write", "_write", "quiet"),
+    *methods("Pca9685Driver", "attach", "release", "flush", "attend", "quiet", "_enable", "_switch", "_wanted"),
+    *methods("_Chip", "attach", "release", "quiet", "flush", "attend", "_set_up", "gone", "_transfer"),
+    *methods("Link", "poll", "report", "send", "_packet", "_answer"),
+    *methods("Commands", "carry_out", "_queue"),
+    *methods(
+        "Commands", "_on_weight_targets", "_on_live_targets", "_on_tempo", "_on_telemetry", "_on_start", "_on_stop", "_on_ping",
+        "_on_arm", "_on_kill",
+    ),
+    *methods("Telemetry", "report", "_report_taps", "_send_taps", "_pack_frame"),
 )
 """What runs while a puppet plays: a larger integer would allocate on a 32-bit port."""
+# fmt: on
 
 
-class CheckedMcu(VirtualMcu):
-    """Computes in no time and has no pins. Its timer stands `before_wrap_us` before its wrap at power on."""
-
-    kind = "checked"
+class CheckedMcu(UnixMcu):
+    """Its timer stands `before_wrap_us` before its wrap at power on, and at each reset."""
 
     def __init__(self, before_wrap_us=2_000_000):
-        firmware = load_checked("firmware/main.py", bytecode=SMALL_INT_FUNCTIONS)
-        self._board = _Board(TICKS_MODULUS - before_wrap_us)
-        self._puppet = firmware.Puppet(self._board)
-        self._link = firmware.Link(self._board, self._puppet)
+        self._start_ticks = TICKS_MODULUS - before_wrap_us
+        super().__init__(binary=__file__)
+        self.kind = "checked"
 
-    @property
-    def now_us(self):
-        return self._board.now_us
+    def _start(self):
+        return CheckedProcess(self._start_ticks, f"{self._ram.name}/kept", self._resets)
 
-    def send(self, data, at_us=None):
-        assert at_us is None, "bytes at later instants are not looked after"
-        self._board.arriving.extend(data)
 
-    def run_until(self, t_us):
-        """Go through `firmware.main.perform`, which would not return before the REPL is called for."""
-        board, puppet, link = self._board, self._puppet, self._link
-        while True:
-            assert not link.poll(), "nothing here calls for the REPL"
-            if board.arriving:
-                continue
-            due_us = t_us
-            if puppet.frame >= 0:
-                until_us = puppet.clock.until_us(board.ticks_us())
-                if until_us <= 0:
-                    puppet.step(link.silent)
-                    link.report()
-                    continue
-                if puppet.prepare():
-                    continue
-                due_us = board.now_us + until_us
-            board.now_us = min(due_us, t_us)
-            if due_us >= t_us:
-                return
+class CheckedProcess(UnixProcess):
+    """A thread that performs as `firmware/unix_main.py` does, until it is reset; nothing calls for the REPL."""
 
-    def receive(self):
-        sent, self._board.sent = self._board.sent, []
-        return sent
+    def __init__(self, start_ticks, kept, resets):
+        self._error = None
+        command_read, self._commands = os.pipe()
+        self._records, record_write = os.pipe()
+        self._buffer = b""
+        arguments = start_ticks, command_read, record_write, kept, resets
+        self._thread = threading.Thread(target=self._run, args=arguments, daemon=True)
+        self._thread.start()
+        for _ in self.records():
+            pass
 
-    def report(self):
-        return {"kind": self.kind, "now_us": self.now_us, "image": "", "image_sha256": ""}
+    def printed(self):
+        return b""
 
     def close(self):
-        """Nothing is open."""
+        for descriptor in (self._commands, self._records):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._commands = self._records = -1
+        self._thread.join()
 
-    def edges(self, pin):
-        raise NotImplementedError("it has no pins")
+    def _run(self, start_ticks, command_read, record_write, kept, resets):
+        memory = types.SimpleNamespace(collect=lambda: 0, mem_free=lambda: 0)
+        try:
+            with open(command_read, "rb") as commands, _Records(record_write) as records:  # noqa: PTH123
+                modules = {"gc": memory}
+                perform = load_checked("firmware/main.py", modules, bytecode=SMALL_INT_FUNCTIONS).perform
+                board = load_checked("firmware/board_unix.py", modules).Board(commands, records, kept, resets)
+                board._start_us = start_ticks
+                perform(board)
+                raise AssertionError("nothing here calls for the REPL")
+        except (SystemExit, BrokenPipeError):
+            pass  # it is closed
+        except BaseException as error:
+            self._error = error
 
-    clear_edges = set_pin = edges
+    def _failed(self, what):
+        self.close()
+        return self._error or AssertionError(what)
 
 
-class _Board:
-    """What the firmware asks of a board."""
+class _Records(io.FileIO):
+    """A file whose `write` takes a length, as on MicroPython."""
 
-    def __init__(self, start_ticks):
-        self.now_us = 0
-        self.arriving = deque()
-        self.sent = []
-        self._start_ticks = start_ticks
+    def __init__(self, descriptor):
+        super().__init__(descriptor, "wb")
 
-    def ticks_us(self):
-        return (self._start_ticks + self.now_us) % TICKS_MODULUS
-
-    def receive(self, buffer):
-        count = min(len(buffer), len(self.arriving))
-        for i in range(count):
-            buffer[i] = self.arriving.popleft()
-        return count
-
-    def send(self, buffer, length):
-        self.sent.append((self.now_us, bytes(buffer[:length])))
-
-    def quiet(self):
-        """No pin has pulses."""
-
-    def heap_free(self):
-        return 0
+    def write(self, data, length=None):
+        rest = memoryview(data)[:length]
+        while rest:
+            rest = rest[super().write(rest) :]

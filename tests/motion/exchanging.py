@@ -51,6 +51,7 @@ class Stage:
         self.session.telemetry(TAPS, 1, 0)
         if robot:
             self.session.arm()
+            self.session.wait_attached()
         self.begin()
 
     def begin(self):

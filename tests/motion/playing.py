@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy
 
 import marotte
-from tests.generate import random_puppet, random_score, to_toml
+from marotte.emulated import connected
+from tests.generate import add_random_dynamics, random_puppet, random_score, to_toml
 
 TAPS = ("base", "signal", "motor")
 
@@ -29,7 +30,9 @@ def random_case(seed, seconds, draw=0, **options):
     """
     rng = random.Random(f"{seed}.{draw}")
     puppet = random_puppet(rng, level="full", gains=False, **options)
-    return Case(f"seed {seed}.{draw}", puppet, random_score(rng, puppet, seconds, level="full", gains=False))
+    score = random_score(rng, puppet, seconds, level="full", gains=False)
+    add_random_dynamics(rng, puppet)
+    return Case(f"seed {seed}.{draw}", puppet, score)
 
 
 def load(case):
@@ -43,8 +46,13 @@ def load(case):
 
 
 def play(case, seconds, mcu="unix"):
-    """Return the rendering of a case: `mcu` and the result are those of `marotte.render`."""
+    """Return the rendering of a case: `mcu` and the result are those of `marotte.render`.
+
+    To an emulated MCU is connected what the robot has beside its outputs.
+    """
     puppet, score, robot = load(case)
+    if not isinstance(mcu, str):
+        robot = connected(mcu, robot)
     return marotte.render(puppet, score, seconds, mcu, robot=robot)
 
 

@@ -6,6 +6,7 @@ played from the start, as both are explicit in time.
 """
 
 import copy
+import itertools
 import random
 import tomllib
 from pathlib import Path
@@ -64,13 +65,18 @@ def has_room(document):
     return len(document["dof"]) < 16 and len(document["action"]) < 64 and mappings < 512
 
 
-def undisturbed(case, frames, mcu=None):
+def undisturbed(case, frames, robot=None):
     """Return what is seen of a case without any exchange."""
     puppet = puppet_of(case.puppet)
-    with mcu or UnixMcu() as virtual:
-        stage = Stage(virtual, puppet, score_of(case.score, puppet))
+    with UnixMcu() as mcu:
+        stage = Stage(mcu, puppet, score_of(case.score, puppet), robot)
         stage.play_until(frames - 1)
         return stage.seen[:frames]
+
+
+def asked(seen):
+    """Return what is seen without the motor tap: where the motion jumps, motors follow in their own time."""
+    return [{dof: taps[:2] for dof, taps in values.items()} for values in seen]
 
 
 def assert_same(seen, expected):
@@ -146,7 +152,7 @@ AT_FRAME, FRAMES = 60, 120
 def exchanged(before, after, score=None, later=None):
     """Return what is seen when one puppet's tables come in for another's after AT_FRAME, and the frame from which they act.
 
-    That is the first frame that is not as without the exchange. `later` is done with the stage afterwards.
+    That is the first frame whose base is not as without the exchange. `later` is done with the stage afterwards.
     """
     expected = undisturbed(Case("before", before, score or SCORE), FRAMES)
     puppet = puppet_of(before)
@@ -160,7 +166,9 @@ def exchanged(before, after, score=None, later=None):
         stage.play_until(FRAMES - 1)
         assert stage.status()["late_targets"] == 0
     seen = stage.seen[:FRAMES]
-    acts = next((frame for frame in range(FRAMES) if seen[frame] != expected[frame]), FRAMES)
+    acts = next(
+        (n for n, (new, old) in enumerate(zip(asked(seen), asked(expected), strict=True)) if new != old), FRAMES
+    )
     assert acts > AT_FRAME
     return seen, acts
 
@@ -172,7 +180,6 @@ CHANGES = {
     "an expression": {"action__SWAY__map": [["NECK", 0, 1, "noise1"], ["HEAD", 0.2, 0.9, "0.5*live(GAZE)"]]},
     "a curve": {"function__SAW": {"table": [1, 0, 0.3, 0.7]}},
     "a range": {"action__ROLL__map": [["WHEEL", 0.5, -1, "noise3"], ["HEAD", 1, 0, "SAW"]]},
-    "limits": {"dof__HEAD": {"limits": [0.4, 0.6]}},
 }
 
 
@@ -181,7 +188,31 @@ def test_what_is_explicit_in_time_goes_on_as_that_of_the_new_puppet(change):
     after = small(**CHANGES[change])
     seen, acts = exchanged(small(), after)
     assert AT_FRAME < acts <= AT_FRAME + 5
-    assert_same(seen[acts:], undisturbed(Case("after", after, SCORE), FRAMES)[acts:])
+    assert_same(asked(seen[acts:]), asked(undisturbed(Case("after", after, SCORE), FRAMES)[acts:]))
+
+
+def test_motors_keep_to_the_limits_of_the_new_puppet():
+    """They may need a little to come back, but not while the base alone changes."""
+    low, high = 0.4, 0.6
+    after = small(dof__HEAD={"limits": [low, high]})
+    seen, acts = exchanged(small(), after)
+    assert acts == FRAMES, "limits are the motor layer's business"
+    heads = [values["HEAD"][2] / 32768 for values in seen]
+    assert not all(low <= head <= high for head in heads[:AT_FRAME])
+    assert all(low - 1 / 32768 <= head <= high + 1 / 32768 for head in heads[AT_FRAME + 20 :])
+
+
+def test_character_that_a_puppet_gets_takes_over_without_a_jump():
+    after = small(dof__NECK={"rest": 0.3, "character": {"f": 1, "zeta": 0.5, "r": -1}})
+    seen, acts = exchanged(small(), after)
+    assert acts == FRAMES
+    necks = [values["NECK"][2] / 32768 for values in seen]
+    assert (
+        necks[AT_FRAME + 10 :]
+        != [values["NECK"][2] / 32768 for values in undisturbed(Case("", small(), SCORE), FRAMES)][AT_FRAME + 10 :]
+    )
+    steps = [abs(b - a) for a, b in itertools.pairwise(necks)]
+    assert max(steps[AT_FRAME - 2 : AT_FRAME + 30]) < 2 * max(steps[: AT_FRAME - 2])
 
 
 @pytest.mark.parametrize("action", ["SWAY", "ROLL"])
@@ -195,7 +226,8 @@ def test_a_tempo_that_changes_is_a_tempo_change(action):
 def test_a_tempo_of_a_cue_stays_where_the_file_has_the_same_as_before():
     score = {"cue": [*SCORE["cue"], {"at": 1.5, "tempo": {"SWAY": 2.9}}]}
     seen, acts = exchanged(small(), small(**CHANGES["a range"]), score)
-    assert_same(seen[acts:], undisturbed(Case("after", small(**CHANGES["a range"]), score), FRAMES)[acts:])
+    after = undisturbed(Case("after", small(**CHANGES["a range"]), score), FRAMES)
+    assert_same(asked(seen[acts:]), asked(after[acts:]))
 
 
 def test_an_action_that_is_gone_leaves_its_dofs_to_hold_where_they_are():
@@ -203,8 +235,10 @@ def test_an_action_that_is_gone_leaves_its_dofs_to_hold_where_they_are():
     seen, acts = exchanged(small(), small(action__SWAY=None, action__ROLL__map=[["WHEEL", -1, 1, "noise3"]]))
     base = seen[AT_FRAME]["NECK"][0]
     assert base != round(0.3 * 32768)
+    held = asked(seen)
     for frame in range(acts, FRAMES):
-        assert seen[frame]["NECK"] == seen[acts - 1]["NECK"] and seen[frame]["HEAD"] == seen[acts - 1]["HEAD"]
+        assert held[frame]["NECK"] == held[acts - 1]["NECK"] and held[frame]["HEAD"] == held[acts - 1]["HEAD"]
+    assert abs(seen[-1]["NECK"][2] - seen[-1]["NECK"][1]) <= 1
 
 
 def test_a_new_action_rests_until_it_is_called_and_then_enters():
@@ -230,7 +264,7 @@ def test_an_action_that_comes_back_rests_and_begins_anew():
             stage.exchange(puppet)
         stage.play_until(70)
         assert 0 not in stage.weights() and stage.weights()[1] > 0
-        assert stage.seen[70]["NECK"] == stage.seen[50]["NECK"]
+        assert stage.seen[70]["NECK"][:2] == stage.seen[50]["NECK"][:2]
         stage.session.weight_targets(formats.FRAME_NOW, {0: formats.WEIGHT_ONE})
         stage.play_until(110)
         assert stage.seen[110]["NECK"] != stage.seen[50]["NECK"]
@@ -245,9 +279,23 @@ def test_dofs_and_channels_that_are_new_begin_at_rest():
     )
     seen, _ = exchanged(small(), grown)
     assert_same(seen, undisturbed(Case("before", small(), SCORE), FRAMES))
-    ears = [values["EAR"][0] / 32768 for values in seen if "EAR" in values]
-    assert ears[0] == pytest.approx((0.9 + 0.2) / 2, abs=0.01)  # SWAY has all its weight, HOLD only begins to leave
+    ears, motors = ([values["EAR"][tap] / 32768 for values in seen if "EAR" in values] for tap in (0, 2))
+    first = next(n for n, ear in enumerate(ears) if ear != pytest.approx(0.9, abs=1e-4))
+    assert first <= 3, "before the exchange it was at rest, in the frames that were told of afterwards"
+    assert ears[first] == pytest.approx((0.9 + 0.2) / 2, abs=0.01)  # SWAY has all its weight, HOLD only begins to leave
     assert ears[-1] == pytest.approx(0.2, abs=0.01)
+    assert motors[:first] == pytest.approx([0.9] * first, abs=1e-4)
+    assert motors[first] == pytest.approx(0.9, abs=0.01)  # the tap's spline looks half a tick ahead
+    assert motors[-1] == pytest.approx(0.2, abs=0.03)
+
+
+@pytest.mark.parametrize("rate_hz", [10, 30, 60])
+def test_a_dof_that_is_new_and_stays_at_rest_does_not_move(rate_hz):
+    mappings = [*small()["action"]["SWAY"]["map"], ["EAR", 0.9, 0.9, "const(1)"]]
+    grown = small(frame_rate=rate_hz, dof__EAR={"rest": 0.9}, action__SWAY__map=mappings)
+    seen, _ = exchanged(small(frame_rate=rate_hz), grown)
+    ears = {values["EAR"] for values in seen if "EAR" in values}
+    assert ears == {(round(0.9 * 32768),) * 3}
 
 
 def test_a_dof_of_another_kind_is_a_new_one():
@@ -260,6 +308,8 @@ def test_a_dof_of_another_kind_is_a_new_one():
         [{"NECK": values["NECK"]} for values in seen],
         [{"NECK": values["NECK"]} for values in exchanged(small(), small())[0]],
     )
+    wheels = [values["WHEEL"][2] / 32768 for values in seen[acts:]]
+    assert max(abs(b - a) for a, b in itertools.pairwise(wheels)) < 0.25
 
 
 def bad_tables(puppet):
@@ -416,7 +466,7 @@ def exchange_on_rp2040(image, count):
         status = stage.status()
     assert (status["late_frames"], status["late_targets"], status["damaged"]) == (0, 0, 0)
     assert status["late_max_us"] < LATE_MAX_US
-    assert_same(stage.seen[:frames], undisturbed(case, frames))
+    assert_same(stage.seen[:frames], undisturbed(case, frames, robot))
     return status, times_us
 
 

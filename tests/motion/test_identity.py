@@ -1,92 +1,72 @@
 """The same numbers on every MCU: 64-bit and 32-bit words on a PC, and Thumb code on the emulated RP2040.
 
-A difference would be an overflow or a sign bug. The RP2040's pins are read in the same run: their pulses are those that the
-motor tap and the robot file ask for, to one count of the PWM timer.
+A difference would be an overflow or a sign bug. The RP2040's pins are read in the same run: tick by tick their pulses are those
+that the motor layer has written on the PC, to one count of the PWM timer.
 """
 
-import bisect
 import hashlib
-import math
 import random
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy
 import pytest
 
-from marotte.link import unpack
+import marotte
+from marotte.emulated import connected
 from marotte.mcu.rp2040 import Rp2040Mcu
+from marotte.mcu.unix import UnixMcu
 from marotte.pulses import pulses
 from marotte.rendering import Rendering
-from shared import codec
+from marotte.wiring import Robot
 from tests.corners import corners
 from tests.corners_full import full_corners
-from tests.motion.playing import TAPS, Case, play, random_case, tap
+from tests.generate import random_robot
+from tests.motion.playing import TAPS, Case, load, random_case, tap
 
 SEEDS = range(200, 220)
 SECONDS = 5
 WORKERS = 2
 
 TIMER_COUNT_US = 0.32
-FRAME_LONGEST_US = 4_000
-"""From the instant of a frame to the last byte of its telemetry, at most."""
+BRIDGE_US = 50
+BRIDGE_COUNT_US = 0.008
+AFTER_TICK_US = 2200
+"""A servo's period begins so long after the tick that has written its pulse, and what it takes to start a PWM slice."""
 
-OUTPUT_PINS = (*range(2, 23), *range(26, 29))
+WRITTEN_US = 3400
+"""After so long a tick has written what it has to write, and before the next one."""
+
+BUSY_ACTIONS, BUSY_RATE_HZ, CALM_RATE_HZ = 30, 50, 120
+"""An RP2040 is in time with 30 actions at 50 frames a second and quick ticks; with more it is with slower ones."""
 
 
 class Played(NamedTuple):
-    """One case on the three MCUs; `edges` by DOF and `reported_us`, the instants of the taps messages, on the RP2040."""
+    """One case on the three MCUs.
+
+    `reference` is the PC again, with a robot whose outputs are written in each tick; `drives` are what the PCs have written,
+    `edges` those of the RP2040's pins.
+    """
 
     case: Case
+    robot: Robot
     renderings: dict[str, Rendering]
-    edges: dict[str, list[tuple[int, int]]]
-    reported_us: list[int]
-
-
-class ListenedRp2040(Rp2040Mcu):
-    """An emulated RP2040 that remembers all that it has sent."""
-
-    def __init__(self, image):
-        super().__init__(image)
-        self.sent = []
-
-    def receive(self, link=None):
-        received = super().receive(link)
-        self.sent += received
-        return received
-
-
-def random_robot(rng, puppet):
-    """Return a robot with a pin, a range, a trim and a sense of its own for most DOFs; no two share a PWM channel."""
-    pins = {pin % 16: pin for pin in rng.sample(OUTPUT_PINS, len(OUTPUT_PINS))}
-    free = rng.sample(list(pins.values()), len(pins))
-    outputs = {}
-    for name in puppet["dof"]:
-        if rng.random() < 0.9:
-            low_us, high_us = rng.choice(
-                ((1000, 2000), (600.5, 2700), sorted(rng.uniform(600, 2700) for _ in range(2)))
-            )
-            outputs[name] = {
-                "pin": free.pop(),
-                "pulse_us": [round(low_us, 3), round(high_us, 3)],
-                "trim_us": round(rng.uniform(-300, 300), 2),
-                "invert": rng.random() < 0.4,
-            }
-    return {"name": "random", "output": outputs}
+    drives: dict[str, dict]
+    edges: dict[int, list[tuple[int, int]]]
 
 
 def identity_cases():
-    """Return the cases: random ones with limits and a robot, and the corners with the largest and the smallest numbers."""
+    """Return the cases: random ones with a robot, and the corners with the largest and the smallest numbers."""
     cases = []
     for seed in SEEDS:
-        rng = random.Random(-seed)
         case = random_case(seed, SECONDS)
-        for dof in case.puppet["dof"].values():
-            if rng.random() < 0.4:
-                least = -1 if dof.get("kind") == "relative" else 0
-                middle = 0 if least else dof.get("rest", 0.5)
-                dof["limits"] = [round(rng.uniform(least, middle), 3), round(rng.uniform(middle, 1), 3)]
-        cases.append(case._replace(robot=random_robot(rng, case.puppet)))
+        robot = random_robot(random.Random(-seed), case.puppet)
+        if len(case.puppet["action"]) > BUSY_ACTIONS or case.puppet.get("frame_rate", 30) > BUSY_RATE_HZ:
+            for rated in (robot, *robot["output"].values()):
+                if "rate" in rated:
+                    rated["rate"] = min(rated["rate"], CALM_RATE_HZ)
+        cases.append(case._replace(robot=robot))
     named = (
         "everything at once",
         "fastest phases",
@@ -105,47 +85,37 @@ def played(rp2040_image_path):
     """Futures of `Played`, one for each case."""
 
     def on_all(case):
-        renderings = {kind: play(case, SECONDS, kind) for kind in ("unix", "unix32")}
-        with ListenedRp2040(rp2040_image_path) as mcu:
-            renderings["rp2040"] = play(case, SECONDS, mcu)
-            outputs = (case.robot or {}).get("output", {})
-            edges = {name: mcu.edges(output["pin"]) for name, output in outputs.items()}
-        return Played(case, renderings, edges, taps_instants_us(mcu.sent))
+        puppet, score, robot = load(case)
+        renderings, drives = {}, {}
+        for name, bits, driven in (("unix", 64, robot), ("unix32", 32, robot), ("reference", 64, in_each_tick(robot))):
+            with UnixMcu(bits) as mcu:
+                renderings[name] = marotte.render(puppet, score, SECONDS, mcu, connected(mcu, driven))
+                drives[name] = mcu.drives()
+        with Rp2040Mcu(rp2040_image_path) as mcu:
+            renderings["rp2040"] = marotte.render(puppet, score, SECONDS, mcu, connected(mcu, robot))
+            edges = {pin: mcu.edges(pin) for pin in drives["unix"]}
+        return Played(case, robot, renderings, drives, edges)
 
     with ThreadPoolExecutor(WORKERS) as pool:
         yield [pool.submit(on_all, case) for case in CASES]
 
 
-def taps_instants_us(sent):
-    """Return the instants at which the taps messages of frames 0, 1, 2 .. ended; `sent` is what an MCU sent, in pieces."""
-    instants_us = []
-    packet = bytearray()
-    for t_us, data in sent:
-        for byte in data:
-            if byte:
-                packet.append(byte)
-                continue
-            length = codec.decode(packet, len(packet))
-            message = unpack(packet[0], bytes(packet[2 : length - 4])) if length > 0 else None
-            if message and message.name == "taps":
-                assert message.fields["frame"] == len(instants_us)
-                instants_us.append(t_us)
-            packet.clear()
-    return instants_us
-
-
-def pulse_us(output, share):
-    """Return the pulse width at a share 0..1 of the DOF's range, as the robot file defines it."""
-    low_us, high_us = (end_us + output["trim_us"] for end_us in output["pulse_us"])
-    return low_us + (high_us - low_us) * (1 - share if output["invert"] else share)
+def in_each_tick(robot):
+    """Return the robot with all outputs written in each tick of the same motor layer."""
+    outputs = {name: replace(output, rate_hz=None) for name, output in robot.outputs.items()}
+    written = replace(robot, rate_hz=1e6 / (robot.motor_period_us - 1), outputs=outputs)  # 1 us: periods are rounded up
+    assert written.motor_period_us == robot.motor_period_us
+    return written
 
 
 @pytest.mark.parametrize("number", range(len(CASES)), ids=[case.name for case in CASES])
 def test_renderings_are_identical_to_the_bit_on_all_mcus(played, number):
     renderings = played[number].result().renderings
+    late = [rendering.status["late_frames"] for rendering in renderings.values()]
+    assert not any(late), "the motor layer had to guess"
     for name in TAPS:
         expected = tap(renderings["unix"], name)
-        for kind in ("unix32", "rp2040"):
+        for kind in ("reference", "unix32", "rp2040"):
             found = tap(renderings[kind], name)
             differ = numpy.argwhere(found != expected)
             assert found.shape == expected.shape and not len(differ), f"{name} on {kind} differs, first at {differ[0]}"
@@ -160,33 +130,83 @@ def test_rp2040_tells_what_it_ran(played, rp2040_image_path):
     print(f"image {sha256}, {sum(instructions)} instructions in {len(reports)} runs")
 
 
+@pytest.mark.parametrize("number", range(len(CASES)), ids=[case.name for case in CASES])
+def test_pulses_written_are_identical_on_both_pcs(played, number):
+    drives = played[number].result().drives
+    assert drives["unix32"] == drives["unix"]
+
+
 @pytest.mark.parametrize("number", range(len(SEEDS)), ids=[case.name for case in CASES[: len(SEEDS)]])
-def test_pulses_on_the_pins_are_those_of_the_motor_tap(played, number):
-    case, renderings, edges, reported_us = played[number].result()
-    rendering = renderings["rp2040"]
-    # The MCU goes on for some frames after the last one that is rendered.
-    end_us = next(iter(reported_us[len(rendering.frames) :]), math.inf) - FRAME_LONGEST_US
-    for name, output in case.robot["output"].items():
-        dof = rendering.puppet.dofs[name]
-        least = -1 if dof.is_relative else 0
-        rest = min(max(dof.rest, dof.limits[0]), dof.limits[1])
-        # From frame -1, which is the rest before the start, the widths in the order of frames.
-        widths_us = [pulse_us(output, (value - least) / (1 - least)) for value in (rest, *rendering.motor[name])]
-        found = [pulse for pulse in pulses(edges[name]) if pulse.start_ns / 1000 < end_us]
-        assert len(found) >= (SECONDS - 0.1) / 0.02
-        for pulse in found:
-            expected = widths_in_effect(widths_us, reported_us, pulse.start_ns / 1000)
-            error_us = min(abs(pulse.width_ns / 1000 - width_us) for width_us in expected)
-            assert error_us <= TIMER_COUNT_US, (
-                f"{name}: the pulse at {pulse.start_ns / 1e9:.4f} s is {pulse.width_ns / 1000:.2f} us long, expected {expected}"
-            )
+def test_pulses_on_the_pins_are_those_that_the_motor_layer_has_written(played, number):
+    _, robot, _, drives, edges = played[number].result()
+    if not robot.outputs:
+        pytest.skip("this robot has no outputs")
+    period_us = robot.motor_period_us
+    written = written_by_tick(drives["reference"], period_us, robot)
+    base_us = None
+    for output in robot.outputs.values():
+        pin = output.drive.pulse_pin
+        if pin is None:
+            continue
+        found = pulses(edges[pin])
+        rises_us = numpy.array([pulse.start_ns / 1000 for pulse in found])
+        base_us = rises_us[0] - AFTER_TICK_US if base_us is None else base_us
+        assert numpy.allclose(numpy.diff(rises_us), robot.written_us(output), rtol=0, atol=0.001), f"pin {pin}"
+        ticks = numpy.arange(len(found)) * robot.turns(output)
+        widths_us = numpy.array([pulse.width_ns / 1000 for pulse in found])
+        assert_follows(pin, ticks, widths_us, written[pin], TIMER_COUNT_US)
+    for output in robot.outputs.values():
+        if output.drive.pulse_pin is None and base_us is not None and robot.turns(output) == 1:
+            for pin in set(output.drive.pins) & set(written):
+                widths_us = duties(edges[pin], base_us, period_us)
+                assert_follows(pin, numpy.arange(len(widths_us)), widths_us, written[pin], BRIDGE_COUNT_US)
 
 
-def widths_in_effect(widths_us, reported_us, at_us):
-    """Return the widths that a pulse may have that begins `at_us`.
+def assert_follows(pin, ticks, widths_us, expected_us, tolerance_us):
+    """Assert that the widths found after some ticks are those expected, which may begin any number of ticks later or earlier.
 
-    It is that of the last frame reported, and while the next frame may be under way, that one's too.
+    Before the first that is expected stands what the pin has while nothing moves.
     """
-    done = bisect.bisect_right(reported_us, at_us)
-    begun = bisect.bisect_right(reported_us, at_us + FRAME_LONGEST_US)
-    return widths_us[done : begun + 1]
+
+    def wrong(shift):
+        places = (ticks + shift).clip(0, None)
+        known = places < len(expected_us)
+        return numpy.abs(widths_us[known] - expected_us[places[known]]) > tolerance_us
+
+    span = ticks[-1] // 4
+    fewest = min((wrong(shift) for shift in range(-span, span)), key=lambda off: (off.sum(), -len(off)))
+    assert len(fewest) > 0.7 * len(ticks)
+    first = numpy.flatnonzero(fewest)[:1]
+    assert not fewest.any(), f"pin {pin}: {fewest.sum()} of {len(fewest)} pulses are wrong, the first is number {first}"
+
+
+def written_by_tick(drives, period_us, robot):
+    """Return the widths in microseconds that were in force after each tick, arrays by pin.
+
+    They begin at one tick. Until its first width a servo's pin counts as if it had that already, a bridge's as low.
+    """
+    servo_pins = {output.drive.pulse_pin for output in robot.outputs.values()}
+    first_us = min(drive.t_us[0] for drive in drives.values())
+    last_us = max(drive.t_us[-1] for drive in drives.values())
+    ticks = numpy.arange(first_us, last_us + 1, period_us)
+    written = {}
+    for pin, drive in drives.items():
+        places = numpy.searchsorted(numpy.array(drive.t_us), ticks, side="right") - 1
+        widths_us = numpy.array(drive.value) / (1 << 18)
+        before_us = widths_us[0] if pin in servo_pins else 0
+        written[pin] = numpy.where(places < 0, before_us, widths_us[places.clip(0)])
+    return written
+
+
+def duties(edges, base_us, period_us):
+    """Return for each tick from `base_us` on how long a bridge's pin was high in a period of the bridge after it."""
+    t_us = numpy.array([t_ns / 1000 for t_ns, _ in edges])
+    levels = numpy.array([level for _, level in edges])
+    high_us = numpy.concatenate([[0], numpy.cumsum(numpy.diff(t_us) * levels[:-1])])
+    ends_us = numpy.arange(base_us + min(WRITTEN_US - AFTER_TICK_US, period_us), t_us[-1], period_us)
+
+    def high_until(at_us):
+        place = numpy.searchsorted(t_us, at_us, side="right") - 1
+        return numpy.where(place < 0, 0, high_us[place] + (at_us - t_us[place]) * levels[place])
+
+    return high_until(ends_us) - high_until(ends_us - BRIDGE_US)

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 PET = str(ROOT / "puppets" / "pet.toml")
 SCORE = str(ROOT / "puppets" / "pet-score.toml")
 ROBOT = str(ROOT / "puppets" / "pet-robot.toml")
-COMMANDS = ("check", "render", "run", "ports", "mcu")
+COMMANDS = ("check", "render", "run", "save", "calibrate", "ports", "mcu")
 
 
 @pytest.fixture
@@ -74,6 +74,29 @@ def test_check_says_what_is_fine(run):
     assert lines[0].startswith(f"{PET}: a puppet with 10 DOFs, ") and lines[0].endswith(": fine")
     assert re.fullmatch(re.escape(SCORE) + r": a score of \d+ cues, 20 s: fine", lines[1])
     assert lines[2] == f"{ROBOT}: a robot with 10 outputs: fine"
+    assert lines[3] == "  motor layer: a tick every 20000 us, 50 Hz"
+    words = "EYEBROW GP2 every 20000 us, written at 50 Hz range 0..1, speed 10, accel 200"
+    assert " ".join(lines[4].split()) == words
+    assert len(lines) == 4 + 10
+
+
+def test_check_shows_the_limits_in_use_and_the_real_periods(run, tmp_path):
+    puppet = tmp_path / "p.toml"
+    puppet.write_text("[dof.A]\nlimits = { range = [0.1, 1], speed = 4 }\n[dof.W]\nkind = 'relative'\n")
+    robot = tmp_path / "r.toml"
+    robot.write_text(
+        "rate = 333\n[chip.C]\nsda = 4\nscl = 5\noe = 6\n"
+        '[output.A]\ndriver = "pca9685"\nchip = "C"\nchannel = 3\nrate = 50\nrange = [0, 0.9]\nspeed = 6\naccel = 50\n'
+        '[output.W]\ndriver = "bridge"\npwm = 2\ndirection = 3\n'
+    )
+    lines = run("check", puppet, robot)[1].splitlines()
+    assert lines[2] == "  motor layer: a tick every 3008 us, 332.4 Hz"
+    assert lines[3:] == [
+        "  A  C 3    every 18022 us, written at 55.41 Hz  range 0.1..0.9, speed 4, accel 50",
+        "  W  GP2/3  PWM of 20 kHz, written at 332.4 Hz   range -1..1, accel 20",
+    ]
+    alone = run("check", robot)[1].splitlines()
+    assert alone[2] == "  A  C 3    every 18022 us, written at 55.41 Hz"
 
 
 def test_check_reports_every_mistake_of_every_file(run, tmp_path, bad):
@@ -100,6 +123,8 @@ def test_check_reports_every_mistake_of_every_file(run, tmp_path, bad):
 
 def test_check_knows_each_kind_by_its_content(run, tmp_path):
     for name, text, kind in (
+        ("d", "[kill]\npin = 2\n", "robot"),
+        ("e", "rate = 60\n", "robot"),
         ("a", "[dof.A]\n", "puppet"),
         ("b", "[[cue]]\nat=0\n", "score"),
         ("c", 'mcu="rp2040"\n', "robot"),
@@ -205,7 +230,89 @@ def test_ports_lists_them(run, monkeypatch):
     assert "no serial port found" in run("ports")[1]
 
 
-@pytest.mark.parametrize("options", [["--link", "uart"], ["--image", "x.uf2"], ["--flash", "x"]])
+SAVE_MISTAKES = [
+    ([], "save needs PUPPET and --robot FILE, or --erase"),
+    ([PET], "save needs PUPPET and --robot FILE, or --erase"),
+    (["--robot", ROBOT], "save needs PUPPET and --robot FILE, or --erase"),
+    ([PET, "--erase"], "--erase takes no puppet, robot or behaviour"),
+    (["--behaviour", "CALM", "--erase"], "--erase takes no puppet, robot or behaviour"),
+    ([PET, "--robot", ROBOT, "--behaviour", "CLAM"], f"{PET} has no behaviour 'CLAM'; did you mean \"CALM\"?"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "expected"), SAVE_MISTAKES)
+def test_save_mistakes_are_told(run, arguments, expected):
+    assert run("save", *arguments, "--mcu", "unix") == (2, "", f"marotte: {expected}\n")
+
+
+def test_save_keeps_the_flash_of_emulated_mcus_only(run):
+    status, _, err = run("save", "--erase", "--port", "/dev/ttyNOSUCH7", "--flash", "x")
+    assert status == 2
+    assert "--flash is for an emulated MCU" in err
+
+
+FLASH_PATHS = [
+    ("", "is a directory"),
+    ("absent/flash.bin", "no such file or directory"),
+    ("file/flash.bin", "not a directory"),
+    ("fifo", "is no file"),
+    ("x" * 300, "file name too long"),
+]
+
+
+@pytest.mark.parametrize("command", [["save", PET, "--robot", ROBOT, "--mcu", "rp2040"], ["mcu", "rp2040"]])
+@pytest.mark.parametrize(("path", "expected"), FLASH_PATHS, ids=[expected for _, expected in FLASH_PATHS])
+def test_flash_that_cannot_be_a_file_is_told_before_anything_starts(
+    run, tmp_path, monkeypatch, command, path, expected
+):
+    monkeypatch.setattr("marotte.mcu.rp2040.EmulatorProcess", lambda *_: pytest.fail("started"))
+    (tmp_path / "file").write_text("")
+    os.mkfifo(tmp_path / "fifo")
+    place = tmp_path / path
+    assert run(*command, "--flash", place) == (1, "", f"marotte: {place}: cannot keep the flash: {expected}\n")
+    assert {each.name for each in tmp_path.iterdir()} == {"file", "fifo"}
+
+
+def test_save_reports_the_mistakes_of_both_files(run, tmp_path, bad):
+    robot = tmp_path / "robot.toml"
+    robot.write_text("[output.NECK]\npin = 0\n")
+    status, _, err = run("save", bad, "--robot", robot, "--mcu", "unix")
+    assert status == 2
+    assert "dof.NECK.rest" in err and "output.NECK.pin" in err
+
+
+@pytest.mark.parametrize("arguments", [["--erase"], [PET, "--robot", ROBOT]])
+def test_save_says_what_is_wrong_with_a_port(run, arguments):
+    status, _, err = run("save", *arguments, "--port", "/dev/ttyNOSUCH7")
+    assert status == 1
+    assert err.startswith("marotte: /dev/ttyNOSUCH7: ") and err.count("\n") == 1
+
+
+def test_save_hands_over_what_is_to_be_kept(run, monkeypatch, tmp_path):
+    saved = []
+    monkeypatch.setattr(commands, "save", lambda *arguments: saved.append(arguments[:2]))
+    assert (
+        run("save", PET, "--robot", ROBOT, "--behaviour", "CALM", "--mcu", "rp2040", "--flash", tmp_path / "f")[0] == 0
+    )
+    assert run("save", "--erase", "--port", "/dev/ttyACM0")[0] == 0
+    (what, where), (nothing, port) = saved
+    assert (what.puppet.name, what.robot.name, what.behaviour) == ("pet", "pet-1", "CALM")
+    assert where == commands.Where(None, "rp2040", tmp_path / "f")
+    assert (nothing, port.port) == (None, "/dev/ttyACM0")
+
+
+def test_calibrate_needs_an_output_of_the_robot(run):
+    expected = f"marotte: {ROBOT} has no output for 'NEK'; did you mean \"NECK\"?\n"
+    assert run("calibrate", ROBOT, "NEK", "--mcu", "unix") == (2, "", expected)
+
+
+def test_calibrate_says_what_is_wrong_with_a_port(run):
+    status, _, err = run("calibrate", ROBOT, "NECK", "--port", "/dev/ttyNOSUCH7")
+    assert status == 1
+    assert err.startswith("marotte: /dev/ttyNOSUCH7: ") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("options", [["--link", "uart"], ["--image", "x.uf2"]])
 def test_mcu_options_of_the_chip_are_not_for_the_pc(run, options):
     status, _, err = run("mcu", "unix", *options)
     assert status == 2

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import pytest
 
+from marotte import limits, pins
 from marotte.check import check_files
 from marotte.expressions import TEXT_MAX
 from marotte.functions import Function, parse_function
@@ -38,10 +39,10 @@ def chapters():
 
 
 def rows():
-    """Return the rows of all tables of keys; a section is what stands before the dot in a heading, empty at the top."""
+    """Return the rows of all tables of keys; a section is the first name in a heading, empty at the top."""
     found = []
     for chapter, text in chapters().items():
-        parts = re.split(r"^### `\[(\w+)\..*\n", text, flags=re.MULTILINE)
+        parts = re.split(r"^#{3,4} `\[?(\w+)[.\]`].*\n", text, flags=re.MULTILINE)
         for section, body in zip(["", *parts[1::2]], parts[::2], strict=True):
             for table in re.findall(r"\| key \|.*\n\|[ |-]*\n((?:\|.*\n)+)", body):
                 cells = [[cell.strip() for cell in line.strip("|\n").split("|")] for line in table.splitlines()]
@@ -53,22 +54,48 @@ def rows():
 AROUND = {
     ("The puppet", ""): "{}\n[dof.A]\n",
     ("The puppet", "dof"): "[dof.A]\n{}\n",
+    ("The puppet", "limits"): "[dof.A]\nlimits = {{ {} }}\n",
+    ("The puppet", "character"): "[dof.A]\ncharacter = {{ {} }}\n",
     ("The puppet", "live"): "[dof.A]\n[live.L]\n{}\n",
     ("The puppet", "action"): '[dof.A]\n[action.X]\n{}\nentry = "start"\nmap = [["A", 0, 1, "rsin"]]\n',
     ("The puppet", "mood"): "[dof.A]\n[mood.M]\n{}\n",
     ("The score", ""): "[[cue]]\n{}\n",
     ("The robot", ""): "{}\n",
+    ("The robot", "kill"): "[kill]\npin = 22\n{}\n",
+    ("The robot", "chip"): "[chip.C]\nsda = 4\nscl = 5\noe = 6\n{}\n",
     ("The robot", "output"): "[output.A]\npin = 2\n{}\n",
+    ("The robot", "duty"): "[output.A]\npin = 2\nduty = {{ {} }}\n",
+    ("The robot", "feedback"): "[output.A]\npin = 2\nfeedback = {{ {} }}\n",
 }
+AROUND_KEYS = {
+    "channel": '[chip.C]\nsda = 4\nscl = 5\noe = 6\n[output.A]\ndriver = "pca9685"\nchip = "C"\n{}\n',
+    "wiring": '[output.A]\ndriver = "bridge"\npwm = 2\ndirection = 3\n{}\n',
+}
+"""The same for keys that other drivers have."""
+
+NEEDED = {
+    "character": {"f": "f = 1"},
+    "duty": {"share": "share = 0.5"},
+    "feedback": {"pin": "pin = 26", "at": "at = [0, 1]"},
+}
+"""Keys that tables within lines cannot do without."""
+INLINE = {"limits", *NEEDED}
+
+
+def text_around(row, line):
+    """Return a file with this line in the row's place, and nothing else that says the same."""
+    text = AROUND_KEYS.get(row.key, AROUND[row.chapter, row.section])
+    if row.section in INLINE:
+        needed = [other for key, other in NEEDED.get(row.section, {}).items() if key != row.key]
+        return text.format(", ".join(filter(None, [*needed, line])))
+    others = [other for other in text.splitlines() if not other.startswith(f"{row.key} = ")]
+    return "\n".join(others).format(line)
 
 
 def read(tmp_path, row, line):
     """Return what a file with this line in the row's place holds, and its mistakes."""
-    text = AROUND[row.chapter, row.section].format(line)
-    if row.key == "entry":
-        text = text.replace('entry = "start"\n', "")
     path = tmp_path / "file.toml"
-    path.write_text(text)
+    path.write_text(text_around(row, line))
     reader = {"The puppet": read_puppet, "The robot": read_robot}.get(row.chapter)
     if reader:
         return reader(path)
@@ -89,7 +116,7 @@ def write_examples(tmp_path):
 def test_documentation_examples_are_without_mistakes(tmp_path):
     report = check_files(write_examples(tmp_path))
     assert report.mistakes == []
-    assert len(report.fine) == 3
+    assert len([line for line in report.fine if line.endswith(": fine")]) == 3
 
 
 RANGES = [row for row in rows() if RANGE.fullmatch(row.values)]
@@ -119,17 +146,41 @@ def test_documentation_has_every_key_and_no_other(tmp_path, monkeypatch):
     has = Table.has
 
     def note(self, key):
-        if len(self.path) in (0, 2):  # not a table of names of the user's choice
-            asked.add((self.path[0] if self.path else "", key))
+        path = self.path
+        if len(path) in (0, 2) or path == ("kill",):  # not a table of names of the user's choice
+            asked.add((path[0] if path else "", key))
+        elif len(path) == 3 and path[2] in INLINE:
+            asked.add((path[2], key))
         return has(self, key)
 
     monkeypatch.setattr(Table, "has", note)
     check_files(write_examples(tmp_path))
-    sections = {"dof", "live", "function", "action", "behaviour", "mood", "cue", "output"}
+    sections = {"dof", "live", "function", "action", "behaviour", "mood", "cue", "output", "chip", "kill"}
     cue = {("cue", row.key) for row in rows() if row.chapter == "The score"}
     documented = {(row.section, row.key) for row in rows() if row.chapter != "The score"} | cue
     keys = {(section, key) for section, key in asked if section != "behaviour" and (section or key not in sections)}
     assert keys == documented
+
+
+def test_documentation_names_the_limits_where_nobody_says():
+    text = " ".join(chapters()["The puppet"].split())
+    for what in (
+        f"`speed` is {limits.DEFAULT_SPEED:g} and `accel` {limits.DEFAULT_ACCEL_ABSOLUTE:g}",
+        f"for a relative DOF `accel` is {limits.DEFAULT_ACCEL_RELATIVE:g}",
+        f"in top speeds a second, at least {limits.ACCEL_RANGE_RELATIVE[0]:g}",
+    ):
+        assert what in text, what
+
+
+def test_documentation_names_what_a_pico_has():
+    text = " ".join(chapters()["The robot"].split())
+    free = [pin for pin in range(pins.PIN_MAX + 1) if pin not in (*pins.LINK_PINS, *pins.TAKEN_PINS)]
+    assert free == [*range(2, 23), *range(26, 29)]
+    assert text.count("2 to 22, 26 to 28") == 7
+    assert f"intervals of {formats.PWM_PERIOD_MAX_US // 100 / 10} ms at most" in text
+    assert formats.DEVICES_MAX == 4 and "four at most" in text
+    first = ", ".join(str(pin) for pin in free if pins.i2c_role(pin) == (0, "sda"))
+    assert f"I2C0 has {first}, I2C1 the others" in text
 
 
 def test_documentation_functions_are_functions():

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from marotte.functions import Function, FunctionError, parse_function
 from marotte.positions import line_numbers
+from marotte.puppet import Character
 from marotte.puppet_file import load_puppet, read_puppet
 from marotte.supported import NOT_YET
 from marotte.tomlfile import FileMistakes, key_text
@@ -85,6 +86,7 @@ def test_puppet_defaults_are_those_of_the_documentation(tmp_path):
     assert (puppet.name, puppet.frame_rate_hz, puppet.noise_spread) == ("bare", 30, 0.0)
     neck = puppet.dofs["NECK"]
     assert (neck.kind, neck.rest, neck.limits, neck.signal, neck.character) == ("absolute", 0.5, (0, 1), True, None)
+    assert (neck.speed, neck.accel, puppet.when_silent) == (None, None, "idle")
 
 
 @pytest.mark.parametrize(
@@ -227,8 +229,6 @@ def test_puppet_mistake_is_named_and_placed(tmp_path, old, new, expected):
 NOT_YET_CASES = [
     ("1, 1.0, 1]", "1, 1.5, 1]", "gains"),
     ("tau = [0.2, 0.3]", 'predict = "kalman"', "kalman"),
-    ("rest = 0.25", "character = { f = 2, zeta = 0.5, r = -1 }", "character"),
-    ("seed = 7", 'when_silent = "relax"', "when_silent"),
 ]
 
 
@@ -237,6 +237,69 @@ def test_puppet_says_what_this_version_does_not_perform(tmp_path, old, new, feat
     assert old in GOOD
     found = mistakes_of(tmp_path, GOOD.replace(old, new, 1))
     assert [line.split(": ", 1)[1] for line in found] == [f"{NOT_YET[feature]} is not supported by this version"]
+
+
+MOTOR = """
+when_silent = "relax"
+[dof.NECK]
+limits = { range = [0.1, 0.9], speed = 3.0, accel = 25 }
+character = { f = 2.0, zeta = 0.5, r = -1.5 }
+[dof.JAW]
+limits = { accel = 1 }
+character = { f = 10 }
+[dof.WHEEL]
+kind = "relative"
+limits = { range = [-0.5, 1], accel = 4 }
+[dof.CASTOR]
+kind = "relative"
+limits = [-1, 0]
+"""
+
+
+def test_puppet_reads_limits_and_characters(tmp_path):
+    path = tmp_path / "p.toml"
+    path.write_text(MOTOR)
+    puppet = load_puppet(path)
+    neck, jaw, wheel, castor = puppet.dofs.values()
+    assert puppet.when_silent == "relax"
+    assert (neck.limits, neck.speed, neck.accel) == ((0.1, 0.9), 3.0, 25.0)
+    assert neck.character == Character(2.0, 0.5, -1.5)
+    assert (jaw.limits, jaw.speed, jaw.accel, jaw.character) == ((0, 1), None, 1, Character(10, 1, 0))
+    assert (wheel.limits, wheel.speed, wheel.accel) == ((-0.5, 1), None, 4)
+    assert (castor.limits, castor.speed, castor.accel) == ((-1, 0), None, None)
+
+
+MOTOR_MISTAKES = [
+    ("speed = 3.0", "speed = 0.04", ":4 dof.NECK.limits.speed: found 0.04, expected a number in 0.05..50"),
+    ("speed = 3.0", "speed = 50.1", ":4 dof.NECK.limits.speed: found 50.1, expected a number in 0.05..50"),
+    ("accel = 25", "accel = 0.9", ":4 dof.NECK.limits.accel: found 0.9, expected a number in 1..1000"),
+    ("accel = 25", "accel = 1001", ":4 dof.NECK.limits.accel: found 1001, expected a number in 1..1000"),
+    ("accel = 25", "acel = 25", ':4 dof.NECK.limits.acel: unknown key; did you mean "accel"?'),
+    (
+        "range = [0.1, 0.9]",
+        "range = [0.9, 0.1]",
+        ":4 dof.NECK.limits.range: found [0.9, 0.1], expected the least value",
+    ),
+    ("range = [0.1, 0.9]", "range = [-0.1, 0.9]", ":4 dof.NECK.limits.range[0]: found -0.1, expected a number in 0..1"),
+    ("accel = 4", "accel = 3.9", ":11 dof.WHEEL.limits.accel: found 3.9, expected a number in 4..1000"),
+    ("accel = 4", "speed = 4", ":11 dof.WHEEL.limits.speed: a relative DOF has none, as its range is its top speed"),
+    ("range = [-0.5, 1]", "range = [0.5, 1]", ":11 dof.WHEEL.limits.range: found [0.5, 1], expected 0 within"),
+    ("limits = [-1, 0]", "limits = [-1, -0.5]", ":14 dof.CASTOR.limits: found [-1, -0.5], expected 0 within"),
+    ("f = 2.0", "f = 0.1", ":5 dof.NECK.character.f: found 0.1, expected a number in 0.2..10"),
+    ("f = 2.0", "f = 10.1", ":5 dof.NECK.character.f: found 10.1, expected a number in 0.2..10"),
+    ("zeta = 0.5", "zeta = 0", ":5 dof.NECK.character.zeta: found 0, expected a number in 0.1..3"),
+    ("r = -1.5", "r = -4.5", ":5 dof.NECK.character.r: found -4.5, expected a number in -4..4"),
+    ("r = -1.5", "q = 1", ":5 dof.NECK.character.q: unknown key"),
+    ("f = 10", "zeta = 1", ':8 dof.JAW.character: has no "f"; expected a frequency in Hz, 0.2..10'),
+    ("{ f = 10 }", "2.0", ":8 dof.JAW.character: found 2.0, expected a table"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), MOTOR_MISTAKES, ids=[case[2][:60] for case in MOTOR_MISTAKES])
+def test_puppet_motor_mistake_is_named_and_placed(tmp_path, old, new, expected):
+    assert old in MOTOR
+    found = mistakes_of(tmp_path, MOTOR.replace(old, new, 1))
+    assert any(expected in line for line in found), found
 
 
 PERFORMED = """

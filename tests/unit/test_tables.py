@@ -2,26 +2,30 @@
 
 import math
 from fractions import Fraction
+from math import floor
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marotte.link import pack
-from marotte.puppet import Dof
+from marotte.character import response
+from marotte.limits import LimitsInUse
+from marotte.link import PAYLOAD_SENT_MAX, pack
+from marotte.puppet import Character, Dof
 from marotte.puppet_file import load_puppet
 from marotte.tables import (
     alpha_q26,
     build_tables,
     fixed,
     items_per_message,
+    limit_fields,
     tempo_q16,
     value_of,
     value_q15,
     weight_q28,
 )
-from marotte.wiring import load_robot
+from marotte.wiring import Robot, load_robot
 from shared import codec, formats, messages, program
 
 PUPPETS = Path(__file__).parents[2] / "puppets"
@@ -69,10 +73,11 @@ def test_tables_begin_announces_what_follows(tmp_path):
     counts = {"dofs": 2, "actions": 3, "mappings": 5, "lives": 2}
     assert {key: begin[key] for key in counts} == counts
     assert (begin["frame_rate_hz"], begin["seed"], begin["noise_spread_q15"]) == (40, 4294967295, 8192)
-    assert begin["link_timeout_ms"] == 750
+    assert (begin["link_timeout_ms"], begin["when_silent"]) == (750, formats.SILENT_IDLE)
     names = [name for name, _, _ in tables.messages()]
     assert names == [
         "begin",
+        "robot",
         "dof",
         "dof",
         "output",
@@ -88,8 +93,24 @@ def test_tables_begin_announces_what_follows(tmp_path):
 
 def test_tables_dofs_are_in_unit_values(tmp_path):
     assert [fields for fields, _ in messages_named(tables_of(tmp_path), "dof")] == [
-        {"dof": 0, "kind": 0, "rest_q15": 8192, "low_q15": 4096, "high_q15": 28672},
-        {"dof": 1, "kind": 1, "rest_q15": 16384, "low_q15": 0, "high_q15": 32768},
+        {
+            "dof": 0,
+            "kind": 0,
+            "rest_q15": 8192,
+            "low_q15": 4096,
+            "high_q15": 28672,
+            "speed_q24": floor(10 * 0.02 * 2**24),  # the defaults, at 50 Hz
+            "accel_q24": floor(200 * 0.02**2 * 2**24) - 1,
+        },
+        {
+            "dof": 1,
+            "kind": 1,
+            "rest_q15": 16384,
+            "low_q15": 0,
+            "high_q15": 32768,
+            "speed_q24": 1 << 24,
+            "accel_q24": floor(20 * 0.02 * 2**23),
+        },
     ]
 
 
@@ -200,19 +221,157 @@ def test_tables_blinks_and_gestures(function_tables):
 
 def test_tables_outputs_have_trim_and_inversion(tmp_path):
     robot = "[output.WHEEL]\npin=3\npulse_us=[1000,2000]\ntrim_us=0.0625\ninvert=true\n[output.NECK]\npin=2\n"
-    assert [fields for fields, _ in messages_named(tables_of(tmp_path, robot), "output")] == [
-        {"dof": 0, "pin": 2, "pulse0_q4us": 16000, "pulse1_q4us": 32000},
-        {"dof": 1, "pin": 3, "pulse0_q4us": 32001, "pulse1_q4us": 16001},
+    assert messages_named(tables_of(tmp_path, robot), "output") == [
+        ({**PLAIN, "dof": 0}, [{"setting": 2}]),
+        ({**PLAIN, "dof": 1, "end0_q4us": 32001, "end1_q4us": 16001}, [{"setting": 3}]),
     ]
 
 
+PLAIN = {"driver": 0, "turns": 1, "end0_q4us": 16000, "end1_q4us": 32000, "dead_q15": 0, "top_q15": 32768}
+
+ROBOT = """
+rate = 100
+attach_interval = 0.25
+autostart = true
+[kill]
+pin = 22
+[chip.UNUSED]
+sda = 2
+scl = 3
+oe = 20
+[chip.BODY]
+sda = 4
+scl = 5
+oe = 6
+address = 0x41
+baud = 1000000
+clock = 26.5
+[output.NECK]
+driver = "pca9685"
+chip = "BODY"
+channel = 9
+rate = 50
+range = [0.25, 1]
+speed = 2
+accel = 100
+release = 1.5
+feedback = { pin = 27, at = [1, 0.25], gain = 0.25, integral = 0.5, most = 0.125, stall = 0.5, stall_time = 0.25 }
+[output.WHEEL]
+driver = "bridge"
+wiring = "two-pwm"
+forward = 12
+backward = 13
+invert = true
+dead_band = 0.25
+top_speed = 0.75
+accel = 8
+duty = { share = 0.5, window = 30 }
+"""
+
+
+def test_tables_robot_with_all_that_it_can_have(tmp_path):
+    tables = tables_of(tmp_path, ROBOT)
+    names = [name for name, _, _ in tables.messages()]
+    parts = ["begin", "robot", "device", "device", "dof", "dof", "output", "output", "feedback", "guard", "guard"]
+    assert names[: len(parts)] == parts
+    ((robot, _),) = messages_named(tables, "robot")
+    assert robot == {"motor_period_us": 10000, "attach_ms": 250, "kill_pin": 22, "kill_level": 1, "autostart": 1}
+    settings = [[2, 3, 64, 20, 400, 25000], [4, 5, 65, 6, 1000, 26500]]
+    assert messages_named(tables, "device") == [
+        ({"device": index, "driver": 1}, [{"setting": setting} for setting in settings[index]]) for index in (0, 1)
+    ]
+    (neck, neck_settings), (wheel, wheel_settings) = messages_named(tables, "output")
+    assert neck == {**PLAIN, "dof": 0, "driver": 1, "turns": 2}
+    assert [item["setting"] for item in neck_settings] == [1, 9]
+    assert wheel == {
+        "dof": 1,
+        "driver": 2,
+        "turns": 1,
+        "end0_q4us": 0,
+        "end1_q4us": 0,
+        "dead_q15": 8192,
+        "top_q15": 24576,
+    }
+    assert [item["setting"] for item in wheel_settings] == [1, 12, 13, 1]
+    ((feedback, _),) = messages_named(tables, "feedback")
+    assert feedback == {
+        "dof": 0,
+        "pin": 27,
+        "at0_q15": 32768,
+        "at1_q15": 8192,
+        "gain_q15": 8192,
+        "integral_q24": round(0.5 * 0.01 * 2**24),
+        "most_q15": 4096,
+        "stall_q15": 16384,
+        "stall_ticks": 25,
+    }
+    assert [fields for fields, _ in messages_named(tables, "guard")] == [
+        {"dof": 0, "release_ms": 1500, "duty_q15": 32768, "window_s": 60},
+        {"dof": 1, "release_ms": 0, "duty_q15": 16384, "window_s": 30},
+    ]
+    (neck, _), (wheel, _) = messages_named(tables, "dof")
+    assert (neck["low_q15"], neck["high_q15"]) == (8192, 28672)  # the puppet says 0.125 to 0.875
+    assert (neck["speed_q24"], neck["accel_q24"]) == (floor(2 * 0.01 * 2**24), floor(100 * 0.01**2 * 2**24) - 1)
+    assert (wheel["speed_q24"], wheel["accel_q24"]) == (1 << 24, floor(8 * 0.01 * 2**23))
+    assert tables.outputs_mask == 0b11
+
+
 def test_tables_without_a_robot_have_no_output(tmp_path):
-    assert messages_named(tables_of(tmp_path), "output") == []
+    tables = tables_of(tmp_path)
+    assert messages_named(tables, "output") == messages_named(tables, "device") == []
+    ((robot, _),) = messages_named(tables, "robot")
+    assert robot == {
+        "motor_period_us": 20000,
+        "attach_ms": 100,
+        "kill_pin": formats.NO_PIN,
+        "kill_level": 0,
+        "autostart": 0,
+    }
+    assert tables.outputs_mask == 0
 
 
-def test_tables_of_the_pet_fit_their_messages():
+def test_tables_characters_are_for_the_robots_rate(tmp_path):
+    text = PUPPET.replace("rest = 0.25", "rest = 0.25\ncharacter = { f = 2.5, zeta = 0.7, r = -0.5 }", 1)
+    (tmp_path / "p.toml").write_text(text.replace("seed", 'when_silent = "relax"\nseed', 1))
+    puppet = load_puppet(tmp_path / "p.toml")
+    tables = build_tables(puppet, Robot(rate_hz=333))
+    ((fields, items),) = messages_named(tables, "character")
+    assert fields == {"dof": 0, **response(Character(2.5, 0.7, -0.5), 0.003008).fixed()}
+    assert items == []
+    ((begin, _),) = messages_named(tables, "begin")
+    assert begin["when_silent"] == formats.SILENT_RELAX
+
+
+PERIODS_US = st.integers(3008 // 8, 20000 // 8).map(lambda steps: 8 * steps)
+
+
+@given(low=st.floats(0, 1), high=st.floats(0, 1), speed=st.floats(0.05, 50), accel=st.floats(1, 1000), us=PERIODS_US)
+def test_limits_of_an_absolute_dof_are_never_exceeded_by_rounding(low, high, speed, accel, us):
+    fields = limit_fields(LimitsInUse((low, high), speed, accel), ABSOLUTE, Fraction(us, 10**6))
+    tick_s = Fraction(us, 10**6)
+    assert (fields["low_q15"], fields["high_q15"]) == (fixed(low, 15), fixed(high, 15))
+    assert 1 <= fields["speed_q24"] <= formats.POSITION_ONE
+    assert 0 <= Fraction(speed) * tick_s * 2**24 - fields["speed_q24"] < 1
+    assert 2 <= fields["accel_q24"] <= formats.POSITION_ONE
+    assert fields["accel_q24"] <= Fraction(accel) * tick_s**2 * 2**24 < fields["accel_q24"] + 2
+
+
+@given(accel=st.floats(4, 1000), us=PERIODS_US)
+def test_limits_of_a_relative_dof_let_it_stand_in_time(accel, us):
+    tick_s = Fraction(us, 10**6)
+    fields = limit_fields(LimitsInUse((-1.0, 1.0), 10.0, accel), RELATIVE, tick_s)
+    assert fields["speed_q24"] == formats.POSITION_ONE
+    stand = -(-formats.POSITION_ONE // 2 * us // (formats.STAND_MS * 1000))
+    assert stand - 1 <= fields["accel_q24"] <= formats.POSITION_ONE
+    assert fields["accel_q24"] * formats.STAND_MS * 1000 >= formats.POSITION_ONE // 2 * us
+    exact = min(Fraction(accel) * tick_s * 2**23, formats.POSITION_ONE)
+    assert abs(fields["accel_q24"] - exact) <= 1
+
+
+@pytest.mark.parametrize("name", ["pet-robot.toml", "pet-robot-pca9685.toml"])
+def test_tables_of_the_pet_fit_their_messages(name):
     puppet = load_puppet(PUPPETS / "pet.toml")
-    tables = build_tables(puppet, load_robot(PUPPETS / "pet-robot.toml", puppet))
+    tables = build_tables(puppet, load_robot(PUPPETS / name, puppet))
     mappings = 0
     for name, fields, items in tables.messages():
         assert len(pack(name, fields, items)) <= codec.PAYLOAD_MAX
@@ -222,11 +381,11 @@ def test_tables_of_the_pet_fit_their_messages():
     assert mappings == sum(len(action.mappings) for action in puppet.actions.values())
 
 
-def test_items_per_message_fill_the_payload():
+def test_items_per_message_fill_what_is_sent_at_once():
     for name, _, fields, items in messages.MESSAGES:
         if items:
             size = messages.size(fields) + items_per_message(name) * messages.size(items)
-            assert codec.PAYLOAD_MAX - messages.size(items) < size <= codec.PAYLOAD_MAX
+            assert PAYLOAD_SENT_MAX - messages.size(items) < size <= PAYLOAD_SENT_MAX
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,33 @@ def test_view_shows_the_beginning_and_silence(view):
     assert "no word from the MCU" in picture(view, Scene(is_silent=True))
 
 
+def test_view_shows_what_is_wrong_with_the_robot(view):
+    scene = Scene(
+        45,
+        {"NECK": 0.25, "BACK": 0.5},
+        stalled=frozenset({"NECK"}),
+        released=frozenset({"BACK"}),
+        alert="killed by the kill pin",
+    )
+    text = picture(view, scene)
+    assert "GP8 stalled" in text and "GP11 released" in text
+    assert "killed by the kill pin" in text
+    assert "GP8 1250.0" not in text
+
+
+def test_view_shows_channels_and_bridges():
+    puppet = load_puppet(PUPPETS / "pet.toml")
+    robot = load_robot(PUPPETS / "pet-robot-pca9685.toml", puppet)
+    scene = Scene(45, {"NECK": 0.25, "WHEEL_LEFT": -0.5, "WHEEL_RIGHT": 0.0})
+    slow = Scene(45, {"WHEEL_LEFT": 1 / 128})
+    text = picture(View(puppet, robot, "here", 20, Console(file=io.StringIO())), scene)
+    assert "SERVOS 6 1250.0 us" in text
+    assert "GP10/11  -54.0%" in text  # half of the way from the dead band of 18 % to the top of 90 %
+    assert "GP12/13   +0.0%" in text
+    assert "GP10/11   +9.6%" in picture(View(puppet, robot, "here", 20, Console(file=io.StringIO())), slow)
+    assert max(map(len, text.splitlines())) <= 80
+
+
 def test_view_without_a_terminal_prints_a_line_a_cue(view):
     with view:
         view.show(Scene(3))

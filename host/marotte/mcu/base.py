@@ -7,6 +7,28 @@ given the same bytes and levels at the same instants gives the same bytes and ed
 from abc import ABC, abstractmethod
 
 
+class VirtualPca9685(ABC):
+    """A PCA9685 that has been attached to an emulated MCU's I2C bus (`VirtualMcu.add_pca9685`)."""
+
+    @abstractmethod
+    def edges(self, channel: int) -> list[tuple[int, int]]:
+        """Changes of the level at output `channel` (0 to 15) since it was attached or `VirtualMcu.clear_edges`: `(t_ns, level)`
+        in order. An output that is not driven counts as level 0.
+        """
+
+    @abstractmethod
+    def registers(self) -> bytes:
+        """All 256 registers as they are now, the number of a register being its index; of an absent chip, its last."""
+
+    @abstractmethod
+    def remove(self) -> None:
+        """Take the chip away from the bus and its supply, now, in the middle of a transfer too: its outputs go low."""
+
+    @abstractmethod
+    def put_back(self) -> None:
+        """Bring it back, with its registers as after power on: asleep, all outputs off."""
+
+
 class VirtualMcu(ABC):
     """An emulated MCU in virtual time.
 
@@ -66,6 +88,30 @@ class VirtualMcu(ABC):
         """Whether the host takes what the MCU sends; while it does not, the MCU's buffers fill up. A kind that cannot tell
         the difference ignores it.
         """
+
+    def set_adc(self, pin: int, ratio: float) -> None:
+        """Put the analog input `pin` (26 to 28) at `ratio` of the ADC's reference, 0 to 1, from now on; at first it is 0.
+
+        Raises `ValueError` for another pin or ratio, `NotImplementedError` if this kind has no analog inputs.
+        """
+        raise NotImplementedError(f"the emulated {self.kind} has no analog inputs")
+
+    def add_pca9685(
+        self, bus: int, address: int, oe_pin: int | None = None, clock_hz: float = 25_000_000
+    ) -> VirtualPca9685:
+        """Attach a PCA9685 to I2C bus `bus` (0 or 1) at the 7-bit `address`, from now on, and return it.
+
+        `oe_pin` is the pin that its OE input is connected to (high: outputs off); None ties it low. `clock_hz` is the frequency
+        of its own oscillator. Raises `ValueError` if one of them is impossible, `NotImplementedError` if this kind has no I2C.
+        """
+        raise NotImplementedError(f"the emulated {self.kind} has no I2C")
+
+    def set_i2c_stuck(self, bus: int, stuck: bool) -> None:
+        """Whether something holds SDA of I2C bus `bus` low, from now on, so that no transfer gets through.
+
+        Raises `ValueError` for another bus, `NotImplementedError` if this kind has no I2C.
+        """
+        raise NotImplementedError(f"the emulated {self.kind} has no I2C")
 
     def run_for(self, duration_us: int) -> None:
         """Advance virtual time by `duration_us`."""

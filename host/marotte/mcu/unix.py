@@ -5,36 +5,31 @@
         mcu.run_for(100_000)
         print(mcu.receive())
 
-Computing takes no time here. The pins follow a model of the Pico's PWM: periods of 20 ms that begin when a pin is first
-used, and a new pulse width takes effect with the next period.
+Computing takes no time here unless `block` says so. The pins follow the model of `pwm.py`, devices on the I2C buses those in
+files of their own; `unix_process.py` runs the firmware. Nothing runs before virtual time does.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
-import select
 import struct
-import subprocess
 import tempfile
 from pathlib import Path
 
-from marotte.errors import MarotteError
 from marotte.images import unix_binary
-from marotte.mcu.base import VirtualMcu
+from marotte.mcu import unix_process as unix
+from marotte.mcu.base import VirtualMcu, VirtualPca9685
+from marotte.mcu.pca9685 import CHANNELS, Pca9685Chip
+from marotte.mcu.pwm import Drive, Pins
 
-ROOT = Path(__file__).resolve().parents[3]
-PERIOD_NS = 20_000_000
 MAX_STRETCH_US = 1 << 28
-ANSWER_TIMEOUT_S = 300.0
-"""Longest time for an answer: a stretch of virtual time of 268 s has 16000 frames at most."""
-
-HEAP_BYTES = 16 << 20
-STDERR_TAIL_LINES = 20
-_RECORD = struct.Struct("<cIH")
-_ARRIVAL = struct.Struct("<IH")
-_ARRIVAL_MAX = 0xFFFF
+PINS = range(30)
+ANALOG_PINS = range(26, 29)
+I2C_BUSES = range(2)
+I2C_ADDRESSES = range(0x08, 0x78)
+_GENERAL_CALL = 0
+_UNDRIVEN = 2
+_STEPS = 4096  # of an analogue input
 
 
 class UnixMcu(VirtualMcu):
@@ -42,42 +37,30 @@ class UnixMcu(VirtualMcu):
 
     Its words have 64 or 32 `bits`; `binary` names another `micropython` than the one that is built for them.
     `folder` is its working directory, which stands in for the flash; default is an empty one that goes with the MCU.
+    `program` is a script to run instead of the firmware's `unix_main.py`, with the same arguments.
     Raises MarotteError if there is no binary, and later if the firmware fails.
     """
 
-    def __init__(self, bits: int = 64, binary: Path | None = None, folder: Path | None = None):
+    def __init__(
+        self, bits: int = 64, binary: Path | None = None, folder: Path | None = None, program: Path | None = None
+    ):
         self.kind = "unix" if bits == 64 else "unix32"
         self._binary = Path(binary) if binary else unix_binary(bits)
-        self._folder = tempfile.TemporaryDirectory(prefix="marotte-") if folder is None else None
+        self._program = [str(program)] if program else ["-m", "firmware.unix_main"]
+        self._ram = tempfile.TemporaryDirectory(prefix="marotte-")  # for what a reset leaves
+        self._flash = tempfile.TemporaryDirectory(prefix="marotte-") if folder is None else None
+        self._folder = str(folder) if self._flash is None else self._flash.name
         self._now_us = 0
-        self._waiting: list[tuple[int, bytes]] = []
+        self._resets = 0
+        self._waiting: list[tuple[int, int, bytes]] = []
+        self._inputs: dict[tuple[int, bytes], bytes] = {}
+        self._outside: dict[int, int | None] = {}  # levels at pins from outside
+        self._driven: dict[int, int] = {}  # those that the MCU gives them
         self._sent: list[tuple[int, bytes]] = []
-        self._pins: dict[int, _PwmPin] = {}
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
-        command_read, self._commands = os.pipe()
-        self._records, record_write = os.pipe()
-        words = [self._binary, "-X", f"heapsize={HEAP_BYTES}", "-m", "firmware.unix_main"]
-        words += [f"/dev/fd/{command_read}", f"/dev/fd/{record_write}"]
-        try:
-            self._process = subprocess.Popen(
-                [str(word) for word in words],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=self._errors,
-                pass_fds=(command_read, record_write),
-                cwd=folder or (self._folder.name if self._folder else None),
-                env={**os.environ, "MICROPYPATH": str(ROOT)},
-                start_new_session=True,  # Ctrl-C is for us: we still have a puppet to stop
-            )
-        except OSError as error:
-            raise MarotteError(f"{self._binary}: cannot be started: {error.strerror}") from error
-        finally:
-            os.close(command_read)
-            os.close(record_write)
-        assert self._process.stdout is not None
-        os.set_blocking(self._process.stdout.fileno(), False)
-        self._buffer = b""
-        self._read_records()
+        self._pins = Pins()
+        self._devices: list[UnixPca9685] = []
+        self._stuck: set[int] = set()
+        self._process = self._start()
 
     @property
     def now_us(self) -> int:
@@ -87,10 +70,8 @@ class UnixMcu(VirtualMcu):
         at_us = self._now_us if at_us is None else at_us
         if at_us < self._now_us:
             raise ValueError(f"{at_us} us has passed, it is {self._now_us} us")
-        place = len(self._waiting)
-        while place and self._waiting[place - 1][0] > at_us:
-            place -= 1
-        self._waiting.insert(place, (at_us, bytes(data)))
+        for start in range(0, len(data), unix.ARRIVAL_MAX):
+            self._arrive(at_us, unix.BYTES, bytes(data[start : start + unix.ARRIVAL_MAX]))
 
     def run_until(self, t_us: int) -> None:
         while self._now_us < t_us:
@@ -101,16 +82,70 @@ class UnixMcu(VirtualMcu):
         return sent
 
     def edges(self, pin: int) -> list[tuple[int, int]]:
-        model = self._pins.get(pin)
-        return model.edges_until(self._now_us * 1000) if model else []
+        return self._pins.edges(pin, self._now_us)
 
     def clear_edges(self) -> None:
-        for model in self._pins.values():
-            model.edges_until(self._now_us * 1000).clear()
+        self._pins.clear_edges(self._now_us)
+        for device in self._devices:
+            device.chip.clear_edges(self._now_us)
+
+    def drives(self) -> dict[int, Drive]:
+        """Return what was written to each PWM pin, in `pulse_q18us`, since power on or `clear_drives`."""
+        return self._pins.drives()
+
+    def clear_drives(self) -> None:
+        """Forget what was written so far. It takes room: some 16 bytes for each output and motor tick."""
+        self._pins.clear_drives(self._now_us)
 
     def set_pin(self, pin: int, level: int | None) -> None:
-        """Inputs are not modelled on the PC: the firmware has none yet that works without an RP2040."""
-        raise MarotteError(f"pin {pin}: the PC's emulated MCU has no inputs; use rp2040")
+        if pin not in PINS:
+            raise ValueError(f"pin must be {PINS[0]} to {PINS[-1]}, not {pin!r}")
+        if level not in (0, 1, None):
+            raise ValueError(f"level must be 0, 1 or None, not {level!r}")
+        self._set(unix.LEVEL, bytes([pin]), bytes([_UNDRIVEN if level is None else level]))
+        self._outside[pin] = level
+        self._level_changed(self._now_us, pin)
+
+    def set_adc(self, pin: int, ratio: float) -> None:
+        if pin not in ANALOG_PINS:
+            raise ValueError(f"pin must be {ANALOG_PINS[0]} to {ANALOG_PINS[-1]}, not {pin!r}")
+        if not 0 <= ratio <= 1:
+            raise ValueError(f"ratio must be 0 to 1, not {ratio!r}")
+        self._set(unix.ANALOG, bytes([pin]), min(int(ratio * _STEPS), _STEPS - 1).to_bytes(2, "little"))
+
+    def add_pca9685(
+        self, bus: int, address: int, oe_pin: int | None = None, clock_hz: float = 25_000_000
+    ) -> UnixPca9685:
+        """See `VirtualMcu.add_pca9685`. Bus 1 is where SDA is pin 2, 6, 10 .., as on a Pico. All-call is not answered."""
+        if bus not in I2C_BUSES:
+            raise ValueError(f"bus must be 0 or 1, not {bus!r}")
+        if address not in I2C_ADDRESSES:
+            raise ValueError(f"address must be {I2C_ADDRESSES[0]:#04x} to {I2C_ADDRESSES[-1]:#04x}, not {address:#04x}")
+        if oe_pin is not None and oe_pin not in PINS:
+            raise ValueError(f"oe_pin must be {PINS[0]} to {PINS[-1]} or None, not {oe_pin!r}")
+        if clock_hz <= 0:
+            raise ValueError(f"clock_hz must be more than 0, not {clock_hz!r}")
+        device = UnixPca9685(self, bus, address, oe_pin, Pca9685Chip(clock_hz))
+        self._devices.append(device)
+        if oe_pin is not None:
+            self._level_changed(self._now_us, oe_pin)
+        self._tell_presence(bus)
+        return device
+
+    def set_i2c_stuck(self, bus: int, stuck: bool) -> None:
+        if bus not in I2C_BUSES:
+            raise ValueError(f"bus must be 0 or 1, not {bus!r}")
+        (self._stuck.add if stuck else self._stuck.discard)(bus)
+        self._tell_presence(bus)
+
+    def block(self, duration_us: int) -> None:
+        """Let the main loop be busy for so long from the next instant on at which it has waited for a frame."""
+        self._arrive(self._now_us, unix.BLOCK, struct.pack("<I", duration_us))
+
+    def reset(self) -> None:
+        """Reset the MCU now, as its watchdog would: the firmware begins anew, what stands in flash and kept RAM stays."""
+        self._process.close()
+        self._restart()
 
     def report(self) -> dict:
         return {
@@ -118,130 +153,134 @@ class UnixMcu(VirtualMcu):
             "now_us": self._now_us,
             "image": str(self._binary),
             "image_sha256": hashlib.sha256(self._binary.read_bytes()).hexdigest(),
+            "resets": self._resets,
         }
 
     def close(self) -> None:
-        if self._process.poll() is None:
-            self._process.kill()
-        self._process.wait()
-        if self._process.stdout:
-            self._process.stdout.close()
-        for descriptor in (self._commands, self._records):
-            with contextlib.suppress(OSError):
-                os.close(descriptor)
-        self._commands = self._records = -1
-        self._errors.close()
-        if self._folder:
-            self._folder.cleanup()
+        self._process.close()
+        self._ram.cleanup()
+        if self._flash:
+            self._flash.cleanup()
+
+    def _start(self) -> unix.UnixProcess:
+        kept = Path(self._ram.name) / "kept"
+        return unix.UnixProcess(self._binary, self._program, self._folder, kept, self._resets)
+
+    def _restart(self) -> None:
+        """Start the firmware anew; the world around it stays."""
+        self._resets += 1
+        self._pins.reset(self._now_us)
+        self._driven.clear()
+        for device in self._devices:
+            if device.oe_pin is not None:
+                self._level_changed(self._now_us, device.oe_pin)
+        self._waiting[:0] = [(self._now_us, kind, which + value) for (kind, which), value in self._inputs.items()]
+        self._process = self._start()
+
+    def _set(self, kind: int, which: bytes, value: bytes) -> None:
+        """Set an input, which a reset of the MCU leaves as it is."""
+        self._inputs[kind, which] = value
+        self._arrive(self._now_us, kind, which + value)
+
+    def _arrive(self, at_us: int, kind: int, data: bytes) -> None:
+        place = len(self._waiting)
+        while place and self._waiting[place - 1][0] > at_us:
+            place -= 1
+        self._waiting.insert(place, (at_us, kind, data))
+
+    def _tell_presence(self, bus: int) -> None:
+        """Tell the board who answers on a bus."""
+        there: dict[int, bool] = {}
+        for device in self._devices:
+            if device.bus == bus:
+                answers = device.chip.powered and bus not in self._stuck
+                for address in (device.address, _GENERAL_CALL):
+                    there[address] = there.get(address, False) or answers
+        for address, answers in there.items():
+            self._set(unix.DEVICE, bytes([bus, address]), bytes([answers]))
+
+    def _level_changed(self, at_us: int, pin: int) -> None:
+        """Tell devices the level at a pin, which is the MCU's if it drives it."""
+        for device in self._devices:
+            if device.oe_pin == pin:
+                level = self._driven.get(pin)
+                device.chip.set_disabled(at_us, bool(self._outside.get(pin) if level is None else level))
 
     def _run(self, length_us: int) -> None:
-        end_us = self._now_us + length_us
-        arrivals = []
-        while self._waiting and self._waiting[0][0] <= end_us:
-            at_us, data = self._waiting.pop(0)
-            for start in range(0, len(data), _ARRIVAL_MAX):
-                part = data[start : start + _ARRIVAL_MAX]
-                arrivals.append(_ARRIVAL.pack(at_us - self._now_us, len(part)) + part)
-        body = b"".join(arrivals)
-        try:
-            _write_all(self._commands, struct.pack("<II", length_us, len(body)) + body)
-        except OSError:
-            raise self._failed("it has ended") from None
-        self._read_records()
-        self._now_us = end_us
+        start_us = self._now_us
+        end_us = start_us + length_us
+        count = 0
+        while count < len(self._waiting) and self._waiting[count][0] <= end_us:
+            count += 1
+        arrivals = self._waiting[:count]
+        del self._waiting[:count]
+        self._process.begin(length_us, [(at_us - start_us, kind, data) for at_us, kind, data in arrivals])
+        write = self._pins.write
+        kind = at_us = -1
+        for kind, offset_us, data in self._process.records():
+            at_us = start_us + offset_us
+            if kind == unix.WRITTEN:
+                write(at_us, data)
+            else:
+                self._take(kind, at_us, data)
+        self._now_us = at_us
+        if kind == unix.RESET:
+            self._process.close()
+            self._waiting[:0] = [arrival for arrival in arrivals if arrival[0] >= at_us]
+            self._restart()
 
-    def _read_records(self) -> None:
-        """Read records up to the end of the stretch, and what was printed in it."""
-        while True:
-            while len(self._buffer) >= _RECORD.size:
-                kind, offset_us, count = _RECORD.unpack_from(self._buffer)
-                end = _RECORD.size + count
-                if len(self._buffer) < end:
-                    break
-                data, self._buffer = self._buffer[_RECORD.size : end], self._buffer[end:]
-                if kind == b"D":
-                    self._read_printed(self._now_us + offset_us)
-                    return
-                self._take(kind, self._now_us + offset_us, data)
-            self._buffer += self._read_some()
-
-    def _take(self, kind: bytes, at_us: int, data: bytes) -> None:
-        if kind == b"S":
-            self._read_printed(at_us)
-            self._sent.append((at_us, data))
-        elif kind == b"Q":
-            for model in self._pins.values():
-                model.quiet(at_us * 1000)
-        elif kind == b"R":
-            if data[0] in self._pins:
-                self._pins[data[0]].quiet(at_us * 1000)
-        else:
-            for pin, pulse_q4us in struct.iter_unpack("<BH", data):
-                model = self._pins.setdefault(pin, _PwmPin(at_us * 1000))
-                model.pulse(at_us * 1000, pulse_q4us * 1000 // 16)
-
-    def _read_printed(self, at_us: int) -> None:
-        assert self._process.stdout is not None
-        printed = self._process.stdout.read()
-        if printed:
-            self._sent.append((at_us, printed))
-
-    def _read_some(self) -> bytes:
-        ready, _, _ = select.select([self._records], [], [], ANSWER_TIMEOUT_S)
-        if not ready:
-            raise self._failed(f"it has not answered for {ANSWER_TIMEOUT_S:.0f} s")
-        data = os.read(self._records, 1 << 16)
-        if not data:
-            raise self._failed("it has ended")
-        return data
-
-    def _failed(self, what: str) -> MarotteError:
-        self._process.kill()
-        self._process.wait()
-        self._errors.seek(0)
-        tail = self._errors.read().decode(errors="replace").splitlines()[-STDERR_TAIL_LINES:]
-        return MarotteError(
-            "\n".join([f"the firmware on {self._binary} failed: {what}", *(f"    {line}" for line in tail)])
-        )
+    def _take(self, kind: int, at_us: int, data: bytes) -> None:
+        if kind in (unix.SENT, unix.DONE, unix.RESET):
+            printed = self._process.printed()
+            self._sent += [(at_us, part) for part in (printed, data) if part]
+        elif kind == unix.ATTACHED:
+            self._pins.attach(at_us, *struct.unpack("<BII", data))
+        elif kind == unix.ENDED:
+            self._pins.end(at_us, data[0])
+        elif kind in (unix.DRIVEN, unix.LET_GO):
+            pin, level = data if kind == unix.DRIVEN else (data[0], None)
+            self._pins.drive(at_us, pin, level or 0)
+            self._driven.pop(pin, None)
+            if level is not None:
+                self._driven[pin] = level
+            self._level_changed(at_us, pin)
+        elif kind == unix.QUIET:
+            self._pins.quiet(at_us)
+        elif kind == unix.I2C:
+            for device in self._devices:
+                if device.bus == data[0]:
+                    device.hear(at_us, data[1], data[2:])
 
 
-class _PwmPin:
-    """One PWM output: the level's changes, worked out period by period."""
+class UnixPca9685(VirtualPca9685):
+    """A PCA9685 on a bus of a `UnixMcu`."""
 
-    def __init__(self, start_ns: int):
-        self._next_ns = start_ns + PERIOD_NS
-        self._width_ns = 0
-        self._fall_ns = -1  # when the pulse under way ends, -1 if the level is low
-        self._edges: list[tuple[int, int]] = []
+    def __init__(self, mcu: UnixMcu, bus: int, address: int, oe_pin: int | None, chip: Pca9685Chip):
+        self.bus = bus
+        self.address = address
+        self.oe_pin = oe_pin
+        self.chip = chip
+        self._mcu = mcu
 
-    def pulse(self, at_ns: int, width_ns: int) -> None:
-        """Set the width of the pulses from the next period on."""
-        self.edges_until(at_ns)
-        self._width_ns = width_ns
+    def edges(self, channel: int) -> list[tuple[int, int]]:
+        if not 0 <= channel < CHANNELS:
+            raise ValueError(f"channel must be 0 to {CHANNELS - 1}, not {channel!r}")
+        return self.chip.edges(self._mcu.now_us, channel)
 
-    def quiet(self, at_ns: int) -> None:
-        """Drive the pin low, now and from now on."""
-        self.edges_until(at_ns)
-        self._width_ns = 0
-        if self._fall_ns >= 0:
-            self._edges.append((at_ns, 0))
-            self._fall_ns = -1
+    def registers(self) -> bytes:
+        return self.chip.registers()
 
-    def edges_until(self, end_ns: int) -> list[tuple[int, int]]:
-        """Let time pass; return the list of all edges that are remembered."""
-        while True:
-            if 0 <= self._fall_ns <= end_ns:
-                self._edges.append((self._fall_ns, 0))
-                self._fall_ns = -1
-            if self._next_ns > end_ns:
-                return self._edges
-            if self._width_ns:
-                self._edges.append((self._next_ns, 1))
-                self._fall_ns = self._next_ns + self._width_ns
-            self._next_ns += PERIOD_NS
+    def remove(self) -> None:
+        self.chip.set_power(self._mcu.now_us, False)
+        self._mcu._tell_presence(self.bus)
 
+    def put_back(self) -> None:
+        self.chip.set_power(self._mcu.now_us, True)
+        self._mcu._tell_presence(self.bus)
 
-def _write_all(descriptor: int, data: bytes) -> None:
-    view = memoryview(data)
-    while view:
-        view = view[os.write(descriptor, view) :]
+    def hear(self, at_us: int, address: int, data: bytes) -> None:
+        """Take a transfer on the bus, to whomever."""
+        if self.chip.powered and address == self.address:
+            self.chip.write(at_us, data)
+        elif self.chip.powered and address == _GENERAL_CALL:
+            self.chip.general_call(at_us, data)
