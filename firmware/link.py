@@ -62,6 +62,7 @@ class Link:
         self.packets = 0
         self.damaged = 0
         self.is_behind = False
+        self._has_paused = False
         self.out = bytearray(codec.BODY_MAX)
         self.telemetry = Telemetry(board, puppet, self)
         self.store = Store()
@@ -98,10 +99,13 @@ class Link:
             end = board.receive(chunk)
         self.is_behind = end == len(chunk)
         if end == 0:
-            if self._length and ticks_diff(now_us, self._byte_us) > _STALE_US:
-                self._length = 0
-                self.damaged += 1
+            self._has_paused = True
             return False
+        # Only where the line was seen to be still: the main loop itself may have been away for longer.
+        if self._length and self._has_paused and ticks_diff(now_us, self._byte_us) > _STALE_US:
+            self._length = 0
+            self.damaged += 1
+        self._has_paused = False
         start = 0
         while start < end:
             stop = _collect(chunk, start, end, wire, self._length, codec.WIRE_MAX)
