@@ -102,7 +102,7 @@ def test_watchdog_tells_the_time_left(repl):
     repl.exec(REGISTERS + f"mem32[LOAD] = {COUNTS_PER_US * 50_000}\nmem32[SET] = ENABLE")
     repl.exec("before = time.ticks_us(); first = mem32[CTRL] & 0xffffff; time.sleep_ms(20)")
     counts, us = repl.exec("print(first - (mem32[CTRL] & 0xffffff), time.ticks_diff(time.ticks_us(), before))").split()
-    assert abs(int(counts) - COUNTS_PER_US * int(us)) < 200
+    assert abs(int(counts) - COUNTS_PER_US * int(us)) < 1000  # the timer and the counter are read some 0.2 ms apart
 
 
 def test_watchdog_disabled_by_its_registers_stays_quiet(repl):

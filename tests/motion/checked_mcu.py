@@ -34,7 +34,7 @@ SMALL_INT_FUNCTIONS = (
     *methods("Puppet", "start", "stop", "prepare", "step", "_synthesise", "_rest"),
     *methods(
         "Motor", "exchange", "start", "stand", "put", "heard", "arm", "kill", "limit", "attach", "detach", "derive",
-        "attend", "_rearrange", "_tick", "_step", "_tap", "_stand", "_hold_unattached",
+        "attend", "_rearrange", "_tick", "_steps", "_tap", "_stand", "_hold_unattached",
     ),
     *methods("Ring", "put", "rearrange"),
     *methods(
