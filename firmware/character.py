@@ -38,8 +38,9 @@ def _respond(
 
     `input`, `output`, `before` (the input of the last tick) and `rate` are Q24 with 16 added, the coefficients too.
     Output saturates at -4..4, rate at -8..8, the input's step at -1..1.
-    Bits: an operand has 28 with its sign, in limbs of 14 + 14; a coefficient 29, in limbs of 14 + 15. With coefficients
-    within `Tables.RESPONSE_LIMITS_Q24` products stay below 2^29 and the sum of a row within 2 * 6 + 2 * 8 + 16 = 44 in Q24.
+    Bits: an operand has 28 with its sign, in limbs of 14 + 14; a coefficient 29, in limbs of 14 + 15. Products of limbs stay
+    below 2^29. With coefficients as the host computes them (2 at most for error and rate, 16 for the slope) the sum of a row
+    stays within 2 * 6 + 2 * 8 + 16 = 44 in Q24.
     """
     d = 0
     while d < dofs:

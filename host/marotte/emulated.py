@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,13 +42,12 @@ def open_mcu(kind: str, flash: Path | None = None) -> Iterator[VirtualMcu]:
 def connected(virtual: VirtualMcu, robot: Robot) -> Robot:
     """Connect to an emulated MCU what a robot has beside its servos; return the robot as it can be there: without feedback.
 
-    Its kill switch is as it should be, and its chips answer where the kind of MCU has a bus for them.
+    Its kill switch is as it should be, and its chips answer.
     """
     if robot.kill and robot.kill.switch == CLOSED:
         virtual.set_pin(robot.kill.pin, 0)
     for chip in robot.chips.values():
-        with suppress(NotImplementedError):
-            virtual.add_pca9685(i2c_role(chip.sda)[0], chip.address, chip.oe, chip.clock_mhz * 1e6)
+        virtual.add_pca9685(i2c_role(chip.sda)[0], chip.address, chip.oe, chip.clock_mhz * 1e6)
     return without_feedback(robot)
 
 
