@@ -209,7 +209,9 @@ board.close()
     board.mcu.run_for(300 * MS)
     board.mcu.send(b"x")
     told = [line.split() for line in board.repl.finish().splitlines()]
-    assert told[:4] == [["19"]] * 3 + [["98"]]
+    assert told[:3] == [["19"]] * 3
+    # It looks after each millisecond's interrupt, and stops where little more than one would be left: 98 or 99 are over.
+    assert told[3] in (["98"], ["99"])
     received, after_ms = map(int, told[4])
     assert received == 1 and after_ms < 350
 
