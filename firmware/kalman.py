@@ -2,10 +2,9 @@
 
 The targets of a live channel come when the host has something to say, at most one counts per frame. A channel with
 `predict = "kalman"` has a state of position and velocity (per frame) and their covariances. In a frame in which a target
-has arrived it goes on at constant velocity, driven by an acceleration that is random from frame to frame, and the target
-is a reading of its position:
+has arrived it goes on at a constant velocity but for a random walk of that, and the target is a reading of its position:
 
-    p += v                                       P = F P F' + Q,  F = [[1, 1], [0, 1]],  Q = q [[1/4, 1/2], [1/2, 1]]
+    p += v                                       P = F P F' + Q,  F = [[1, 1], [0, 1]],  Q = q [[1/3, 1/2], [1/2, 1]]
     K = [P11, P12] / (P11 + r)                   p += K1 (target - p),  v += K2 (target - p)
     P11 = K1 r,  P12 = K2 r,  P22 -= K2 P12
 
@@ -16,13 +15,14 @@ so does the distance to the last target, by the factor `fade`, and what is not k
 
 What the target will do in frames to come is then, from the last target on, `v = fade v; target += v`, within 0..1.
 
-Three numbers per channel come with the tables. `process_q16` is `q`, the variance of the acceleration (per frame, per
-frame), and `noise_q16` is `r`, the variance of a reading, both in one unit, with 16 binary places, that the host chooses
-per channel: only their ratio counts, and P has the same unit. 1 <= noise <= 2^27, 0 <= process <= 2^27. The unit should be
+Three numbers per channel come with the tables. `process_q16` is `q`, the variance of what a frame adds to the velocity,
+and `noise_q16` is `r`, the variance of a reading, both in one unit, with 16 binary places, that the host chooses per
+channel: only their ratio counts, and P has the same unit. 1 <= noise <= 2^27, 0 <= process <= 2^27. The unit should be
 such that P11 stays below 2^28 in the longest silence; where an element of P would pass that, P stays as it is for a
 frame, so that nothing overflows whatever the numbers are. `fade_q15` is `exp(-1 / (F * fade))`, below 1.
 
-Source: SPEC of motion signal processing (`predict`). The unit of P and the fading are not in it.
+Source: SPEC of motion signal processing (`predict`); the textbook's filter with white noise as acceleration. The fading in
+silence is ours.
 """
 
 import micropython
@@ -55,9 +55,9 @@ def _estimate(
 
     `arrived` has the bit of each channel that got a target in this frame. Targets and positions are Q28 in 0..1, velocities per
     frame within -1..1 with 1 added. `covariance` holds 3 x 16 words, P11, P12 and P22; none is ever negative.
-    Bits: elements of P have 29, their sums 31; P11 + r has 30 and is divided by with 15; gains are Q22 below 2 (twice the
-    process goes to P12 that goes to P11 twice, or more), 24 bits in limbs of 13 + 11; the innovation stays within
-    2^29, in limbs of 15 + 15. Products of limbs stay below 2^27, and 2^30 when shifted.
+    Bits: elements of P have 29, their sums 31; P11 + r has 30 and is divided by with 15; gains are Q22 up to 3/2
+    (what goes to P12 goes to P11 too, but for the process, of which P12 gets 1/2 and P11 1/3), 23 bits in limbs of 12 + 11;
+    the innovation stays within 2^29, in limbs of 15 + 15. Products of limbs stay below 2^27, and 2^30 when shifted.
     """
     i = 0
     while i < lives:
@@ -86,7 +86,7 @@ def _estimate(
                 next11 = ((next11 >> 15) * fade) + (((next11 & 0x7FFF) * fade) >> 15)
                 next12 = ((next12 >> 15) * fade) + (((next12 & 0x7FFF) * fade) >> 15)
                 next22 = ((next22 >> 15) * fade) + (((next22 & 0x7FFF) * fade) >> 15)
-            next11 += q >> 2
+            next11 += q // 3
             next12 += q >> 1
             next22 += q
             if next11 <= _COVARIANCE_MAX and next12 <= _COVARIANCE_MAX and next22 <= _COVARIANCE_MAX:

@@ -1,7 +1,7 @@
 """Prediction of a live channel: a Kalman filter's parameters as the puppet's file has them, and as the MCU has them.
 
-The filter takes a channel's targets for readings of a stick that moves at a constant velocity but for random accelerations.
-Its gains depend on the ratio of the two variances alone, so both travel in a unit chosen to fit the MCU's words.
+The filter takes a channel's targets for readings of a stick that moves at a constant velocity but for a random walk of that.
+Its gains depend on the ratio of two variances alone, so both travel in a unit chosen to fit the MCU's words.
 
 Source: SPEC section 6; `firmware/kalman.py` has the equations.
 """
@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from shared import formats
 
 NOISE_RANGE = (0.0005, 0.1)
-AGILITY_RANGE = (0.5, 100)
+AGILITY_RANGE = (0.1, 20)
 FADE_RANGE_S = (0.02, 1)
 
-_COVARIANCE_MAX = 1 << 28
-"""Beyond it the MCU lets covariances grow no further."""
+_NOISE_MAX_Q16 = formats.VARIANCE_MAX_Q16 // 2
+_COVARIANCE_MAX_Q16 = 1 << 27
+"""Half of what the MCU lets covariances grow to: readings that come and go make a little more than a long silence does."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,9 @@ class Kalman:
 
     noise: float = 0.005
     """Standard deviation of a reading, in units of the channel (0..1): tremor and the steps of the stick's converter."""
-    agility: float = 10.0
-    """Standard deviation of the stick's acceleration, in units a second, a second: more follows quicker and trembles more."""
+    agility: float = 2.0
+    """How much the stick's velocity changes in a second, as a standard deviation, in units a second: more follows quicker and
+    trembles more."""
     fade_s: float = 0.1
     """Time constant with which the velocity dies out, in what is predicted and while nothing arrives."""
 
@@ -36,9 +38,9 @@ class Kalman:
 def kalman_fields(kalman: Kalman, frame_rate_hz: int) -> dict[str, int]:
     """Return `process_q16`, `noise_q16` and `fade_q15` as the message `live` has them."""
     fade = math.exp(-1 / (frame_rate_hz * kalman.fade_s))
-    process = (kalman.agility / frame_rate_hz**2) ** 2
+    process = kalman.agility**2 / frame_rate_hz**3  # of a velocity per frame, in a frame
     noise = kalman.noise**2
-    unit = max(noise / formats.VARIANCE_MAX_Q16, process * _growth(fade) / _COVARIANCE_MAX)
+    unit = max(noise / _NOISE_MAX_Q16, process * _growth(fade) / _COVARIANCE_MAX_Q16)
     return {
         "process_q16": max(round(process / unit), 1),
         "noise_q16": max(round(noise / unit), 1),
@@ -47,9 +49,9 @@ def kalman_fields(kalman: Kalman, frame_rate_hz: int) -> dict[str, int]:
 
 
 def _growth(fade: float) -> float:
-    """Return what the position's variance, by that of the acceleration, comes to in the frame that ends a long silence."""
+    """Return what the position's variance, by that of the process, comes to in the frame that ends a long silence."""
     kept = fade * fade
     p22 = 1 / (1 - kept)
     p12 = (kept * p22 + 0.5) / (1 - kept)
-    p11 = (kept * (2 * p12 + p22) + 0.25) / (1 - kept)
-    return p11 + 2 * p12 + p22 + 0.25
+    p11 = (kept * (2 * p12 + p22) + 1 / 3) / (1 - kept)
+    return p11 + 2 * p12 + p22 + 1 / 3
