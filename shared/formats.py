@@ -50,6 +50,7 @@ TEMPO_MIN_Q16 = 3277  # 0.05
 TEMPO_MAX_Q16 = 8 * TEMPO_ONE
 MASTER_TEMPO_MIN_Q16 = TEMPO_ONE // 4
 MASTER_TEMPO_MAX_Q16 = 4 * TEMPO_ONE
+VARIANCE_MAX_Q16 = 1 << 27  # process and noise of a live channel that is predicted, in a unit of their own
 
 # The motor layer's own rate: one tick every so many microseconds, a multiple of MOTOR_PERIOD_STEP_US.
 MOTOR_PERIOD_MIN_US = 3008
