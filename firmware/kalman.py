@@ -196,6 +196,13 @@ class Kalman:
         )
         # fmt: on
 
+    def is_moving(self, lives):
+        """Return whether any of so many channels is known to move."""
+        for live in range(lives):
+            if self.velocity_q28[live] != ZERO_Q28:
+                return True
+        return False
+
     def rearrange(self, gather_words, keep, scratch, tables):
         """Let other tables have other channels; those that were not there before stand at their rest."""
         gather_words(self.velocity_q28, keep, scratch, tables.lives, ZERO_Q28, 0)
