@@ -46,9 +46,11 @@ class FarSightedPuppet(ReferencePuppet):
 
     @property
     def weights_rest(self):
-        """Whether every weight, of HOLD too, stood at its target in the frame just stepped."""
-        weights = [action.weight for action in self._actions.values()] + [hold.weight for hold in self._holds]
-        return all(weight.at_rest for weight in weights)
+        """Per DOF whether its weights, HOLD's too, stood at their targets in the frame just stepped."""
+        return [
+            hold.weight.at_rest and all(action.weight.at_rest for action in actions)
+            for hold, actions in zip(self._holds, self._actions_of_dof, strict=True)
+        ]
 
     def foresee(self, frames):
         """Return (base, weight_sums), arrays [frames, dofs], of the frames after the one just stepped.

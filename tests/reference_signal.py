@@ -35,7 +35,7 @@ class Signal(NamedTuple):
     gains: the gains in force [frames, 7], highest band first.
     offset: what carries the signal over news [frames, dofs].
     is_clamped: whether the signal would have left its range [frames, dofs].
-    is_at_rest: whether the last news is 254 frames ago and weights and gains are at their targets [frames].
+    is_at_rest: whether the last news is 254 frames ago and the DOF's weights and all gains are at their targets [frames, dofs].
     weight_sums: the lowest sum of a DOF's weights, HOLD included, in the frame and all that were foreseen in it [frames, dofs].
     news: frames in which something arrived.
     is_processed: per DOF whether it has signal processing; elsewhere the signal is the base.
@@ -61,7 +61,7 @@ def render_signal(puppet, score, frames):
     gains, gains_rest = glide(gain_targets(puppet, reference.cues, frames), reference.frame_rate)
     shape = frames, len(reference.dofs)
     base, weight_sums, corrections, steps = (numpy.zeros(shape) for _ in range(4))
-    weights_rest = numpy.empty(frames, bool)
+    weights_rest = numpy.empty(shape, bool)
     foretold = None
     for start, end in itertools.pairwise([*sorted({0, *news}), frames]):
         # As far as frame `end` is foretold to see in the frame before it.
@@ -88,7 +88,7 @@ def render_signal(puppet, score, frames):
         gains=gains,
         offset=numpy.where(is_processed, offset, 0),
         is_clamped=is_processed & (wanted != signal),
-        is_at_rest=weights_rest & gains_rest & (numpy.array(since_news) >= WINDOW),
+        is_at_rest=weights_rest & (gains_rest & (numpy.array(since_news) >= WINDOW))[:, None],
         weight_sums=weight_sums,
         news=news,
         is_processed=is_processed,
