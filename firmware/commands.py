@@ -16,6 +16,7 @@ from firmware.exchange import check_kept
 from firmware.tables import halves
 from shared import codec, messages
 from shared.formats import (
+    BANDS,
     DEVICE_SETTINGS_MAX,
     KILLED_BY_HOST,
     TAP_BASE,
@@ -31,6 +32,7 @@ _LEAN = (
     messages.WEIGHT_TARGETS,
     messages.LIVE_TARGETS,
     messages.TEMPO,
+    messages.GAINS,
     messages.ARM,
     messages.KILL,
     messages.TELEMETRY,
@@ -280,6 +282,9 @@ class Commands:
 
     def _on_tempo(self, body, length):
         return self._queue(cues.TEMPO, body, length, self._puppet.tables.actions)
+
+    def _on_gains(self, body, length):
+        return self._queue(cues.GAIN, body, length, BANDS)
 
     def _on_arm(self, body, length):
         puppet = self._puppet

@@ -19,7 +19,9 @@ from firmware.programs import Programs
 from firmware.tables import Tables, halves, words
 from firmware.trajectory import Ring
 from shared.formats import (
+    BANDS,
     DOFS_MAX,
+    GAIN4_ONE,
     GRADIENTS,
     LIVES_MAX,
     MAPPINGS_MAX,
@@ -38,12 +40,13 @@ class Puppet:
 
     `frame` is the number of the next frame, -1 while the motion does not run. `base_q15` and `signal_q15` hold the last
     frame's values per DOF, after the compositor and after signal processing; `motor.motor_q15` what the motors were
-    told.
+    told. `clipped` counts the values that signal processing has clipped at the ends of their range since `start`.
     """
 
     def __init__(self, board):
         self.frame = -1
         self.frame_max_us = 0
+        self.clipped = 0
         self.clock = clock.FrameClock()
         self.cues = Cues()
         self.drivers = Drivers(board)
@@ -53,6 +56,7 @@ class Puppet:
         self.tempo_q16 = words(1)
         self.actions = Actions()
         self.live_target_q28 = words(LIVES_MAX)
+        self.gain_target4_q16 = words(BANDS)
         self.base_q15 = halves(DOFS_MAX)
         self.signal_q15 = self.base_q15  # until a signal processing layer stands between them
         self.base_ring = Ring()
@@ -95,7 +99,7 @@ class Puppet:
         """Begin the motion anew: frame 0 is due at a motor tick soon. Targets that wait keep their stamps."""
         self._rest()
         self.frame = 0
-        self.frame_max_us = 0
+        self.frame_max_us = self.clipped = 0
         self.cues.counts[0] = 0
         self.clock.start(self.motor.start(), self.tables.frame_rate_hz)
 
@@ -157,7 +161,9 @@ class Puppet:
         counts = self.cues.counts
         counts[1] = self._tempos_changed
         self._tempos_changed = 0
-        self.cues.apply(self.frame, a.target_q28, self.live_target_q28, self.tempo_q16, a.wanted_tempo_q16)
+        self.cues.apply(
+            self.frame, a.target_q28, self.live_target_q28, self.tempo_q16, a.wanted_tempo_q16, self.gain_target4_q16
+        )
         a.compute_phases(t, self._master, rate_hz)
         if counts[1]:
             a.follow_tempos(t, self._master, rate_hz)
@@ -201,6 +207,8 @@ class Puppet:
         self.tempo_q16[0] = TEMPO_ONE
         for place in range(clock.PHASE_WORDS):
             self._master[place] = 0
+        for band in range(BANDS):
+            self.gain_target4_q16[band] = GAIN4_ONE
         self.actions.rest(tables)
         self.blinks.rest(tables)
         for live in range(tables.lives):

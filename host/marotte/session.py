@@ -266,6 +266,13 @@ class Session:
         """Set the tempo of an action by its index, or of all (MASTER), from `frame` on or at once (FRAME_NOW)."""
         self._post_items("tempo", frame, [{"action": action, "tempo_q16": tempo_q16}], on_refused)
 
+    def gains(
+        self, frame: int, gains4_q16: dict[int, int], on_refused: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Send gains of bands by index, the highest 0, from `frame` on or at once (FRAME_NOW)."""
+        items = [{"band": band, "gain4_q16": gain} for band, gain in gains4_q16.items()]
+        self._post_items("gains", frame, items, on_refused)
+
     def telemetry(self, taps: int, taps_every: int, weights_every: int) -> None:
         """Ask for taps (bits of TAP_BASE, TAP_SIGNAL, TAP_MOTOR) and weights, every so many frames; 0 is never.
 
