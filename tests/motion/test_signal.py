@@ -291,12 +291,12 @@ def test_base_responds_in_the_frame_in_which_a_target_arrives():
 def test_news_does_not_jerk_the_signal(capsys):
     """The lowest bands, which see 254 frames ahead, are boosted: without the offset the signal would leap at each news."""
     actions = {
-        "UP": {"tau": 2, "map": [["NECK", 0.3, 0.7, "const(1)"]]},
+        "UP": {"tau": 2, "map": [["NECK", 0.2, 0.9, "const(1)"]]},
         "SWAY": {"tempo": 0.2, "tau": 1, "map": [["NECK", 0.35, 0.65, "rsin"]]},
     }
     puppet = {"name": "calm", "dof": {"NECK": {}}, "action": actions}
     cues = [{"at": 0, "gains": [1, 1, 1, 1, 2, 2, 2], "weights": {"SWAY": 1}}]
-    cues += [{"at": 4 + 2.3 * n, "weights": {"UP": n % 2 * 4 + 0.1}} for n in range(5)]
+    cues += [{"at": 4 + 2.3 * n, "weights": {"UP": n % 2 * 3 + 0.1}} for n in range(5)]
     case = Case("calm", puppet, {"cue": cues})
     expected = render_signal(puppet, case.score, 480)
     base, signal = played(case, 480)
