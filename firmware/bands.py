@@ -83,9 +83,9 @@ def change_table(knots, late):
 
 @micropython.viper
 def smooth(base_q15: ptr16, third_q15: ptr16, row: ptr8, dofs: int, signal: ptr8, first: int, frames: int, scratch: ptr32):
-    """Compute `G_3` anew from the base's ring, of the frames `first .. first + frames - 1`, up to 16.
+    """Compute `G_3` anew from the base's ring, of the frames `first .. first + frames - 1`, up to 17.
 
-    Three times the kernel, in place in `scratch`, 40 words. Bits: Q15 becomes Q19, Q23, Q27.
+    Three times the kernel, in place in `scratch`, 41 words. Bits: Q15 becomes Q19, Q23, Q27.
     """
     d = 0
     while d < dofs:

@@ -113,7 +113,7 @@ class Future:
         self._delta_q15 = words(DOFS_MAX * BLOCK)
         self._column_q15 = halves(DOFS_MAX)
         self._rows = bytearray(DOFS_MAX)
-        self._scratch = words(BLOCK + 24)
+        self._scratch = words(BLOCK + 1 + 24)
         self._frame = 0  # the one that comes next
         self._front = 0  # the first one that is not exact
         self._filled = 0  # the first one of which nothing is known

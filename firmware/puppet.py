@@ -35,7 +35,6 @@ from shared.formats import (
 _COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
 _CARRY_US = const(16000)  # what putting other tables into force takes
 _MARGIN_US = const(3000)  # between the end of a frame and what is done then
-_STARTING_US = const(0x10000000)  # a frame that is so far away is not yet to come
 
 
 class Puppet:
@@ -111,7 +110,7 @@ class Puppet:
             self.motor.stand()
         self._rest()
         self.frame = 0
-        self.clock.start((self._board.ticks_us() + _STARTING_US) & clock.TICKS_MASK, self.tables.frame_rate_hz)
+        self.clock.hold(self.tables.frame_rate_hz)
         self._synthesise(True)
         self._turn()
         self.future.start(self.tables, self)
