@@ -135,8 +135,9 @@ def _sketch_phases(
 ):
     """Write the phases of the playing actions at the knots, and to `pace` by what part of a cycle a frame moves them on.
 
-    `cycle` and `fraction` hold the phases without offsets. Offsets shrink by powers of what a frame leaves of them, however
-    fast that is. Bits: a stride of up to 127 frames times a fraction in Q22 is below 2^29, offsets are Q13.
+    `cycle` and `fraction` hold the phases without offsets. Offsets, here in Q20, shrink by the same amount in every frame as long as that is
+    all they may, then by powers of what a frame leaves of them. Bits: a stride of up to 127 frames times a fraction in Q22 is below
+    2^29; half of what a frame advances is below 2^21, 9 places more make 2^30.
     """
     n = 0
     while n < found:
@@ -151,7 +152,10 @@ def _sketch_phases(
         pace_q22[n] = step_q22
         whole = int(cycle[i])
         fraction = fraction_q24[i] >> 2
-        o = (offset_q28[i] - _ONE_Q28) >> 15
+        o = (offset_q28[i] - _ONE_Q28) >> 8
+        most = ((step_cycles << 22) + step_q22) >> 3
+        a = (warp_q26[i] >> 11) + 1
+        limit = ((most << 9) // a) << 6
         at = n << 4
         b = 0
         while b < knots:
@@ -159,17 +163,25 @@ def _sketch_phases(
             fraction += stride * step_q22
             whole += stride * step_cycles + (fraction >> 22)
             fraction = fraction & 0x3FFFFF
-            if o:
-                power = 32768
-                square = (0x4000000 - warp_q26[i] + 0x400) >> 11
-                k = stride
-                while k:
-                    if k & 1:
-                        power = (power * square + 0x4000) >> 15
-                    square = (square * square + 0x4000) >> 15
-                    k = k >> 1
-                o = (o * power + 0x4000) >> 15
-            total_q24 = (fraction << 2) + (o << 11)
+            if o and stride:
+                size = o if o >= 0 else 0 - o
+                if size > limit and most:
+                    k = (size - limit) // most + 1
+                    if k > stride:
+                        k = stride
+                    size -= k * most
+                    stride -= k
+                if stride:
+                    power = 32768
+                    square = 32769 - a
+                    while stride:
+                        if stride & 1:
+                            power = (power * square + 0x4000) >> 15
+                        square = (square * square + 0x4000) >> 15
+                        stride = stride >> 1
+                    size = ((size >> 6) * power) >> 9
+                o = size if o >= 0 else 0 - size
+            total_q24 = (fraction << 2) + (o << 4)
             cycle_course[at] = (whole + (total_q24 >> 24)) & 0xFFF
             fraction_course_q24[at] = total_q24 & 0xFFFFFF
             at += 1
