@@ -64,6 +64,13 @@ def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console:
     print(f"{out}: {len(rendering.frames)} frames, {len(files.puppet.dofs)} DOFs")
     for key, value in rendering.report.items():
         print(f"  {key}: {value:,}" if isinstance(value, int) else f"  {key}: {value}")
+    if rendering.status["clipped"]:
+        print(f"  {clipping(rendering.status)}")
+
+
+def clipping(status: dict[str, int]) -> str:
+    """Return how often signal processing went out of the range of a DOF, as a status says."""
+    return f"{status['clipped']:,} values clipped by signal processing: the gains are high for where the motion is"
 
 
 @dataclass(frozen=True)
@@ -263,7 +270,8 @@ def _perform(files: Files, carrier: SerialCarrier, where: str, options: RunOptio
     how = "stopped by hand" if performance.is_interrupted else "played"
     late = f", {status['late_frames']} late, at most {status['late_max_us']} us" if status else ""
     errors = f"; {status['bus_errors']} errors on the I2C bus" if status.get("bus_errors") else ""
-    console.print(f"{how}: {performance.frames} frames{late}{errors}; outputs are off", highlight=False)
+    clipped = f"; {clipping(status)}" if status.get("clipped") else ""
+    console.print(f"{how}: {performance.frames} frames{late}{errors}{clipped}; outputs are off", highlight=False)
     return performance.is_interrupted
 
 

@@ -72,12 +72,26 @@ def test_check_says_what_is_fine(run):
     assert (status, err) == (0, "")
     lines = out.splitlines()
     assert lines[0].startswith(f"{PET}: a puppet with 10 DOFs, ") and lines[0].endswith(": fine")
+    del lines[1:5]  # bands and moods
     assert re.fullmatch(re.escape(SCORE) + r": a score of \d+ cues, 20 s: fine", lines[1])
     assert lines[2] == f"{ROBOT}: a robot with 10 outputs: fine"
     assert lines[3] == "  motor layer: a tick every 20000 us, 50 Hz"
     words = "EYEBROW GP2 every 20000 us, written at 50 Hz range 0..1, speed 10, accel 200"
     assert " ".join(lines[4].split()) == words
     assert len(lines) == 4 + 10
+
+
+def test_check_shows_the_bands_at_the_frame_rate_and_the_gains_of_moods(run, tmp_path):
+    puppet = tmp_path / "p.toml"
+    puppet.write_text(
+        "frame_rate = 60\n[dof.A]\n[mood.SHY]\ngains = [-0.5, 2, 1.25, 1, 1, 0, 4]\n[mood.M]\ntempo = 2\n"
+    )
+    _, *lines = run("check", puppet)[1].splitlines()
+    assert lines == [
+        "  bands, in Hz    30  8.4   4.0  2.0  0.99  0.49  0.25",
+        "  gains of SHY  -0.5    2  1.25    1     1     0     4",
+        "  gains of M       1    1     1    1     1     1     1  tempo 2",
+    ]
 
 
 def test_check_shows_the_limits_in_use_and_the_real_periods(run, tmp_path):
@@ -90,8 +104,8 @@ def test_check_shows_the_limits_in_use_and_the_real_periods(run, tmp_path):
         '[output.W]\ndriver = "bridge"\npwm = 2\ndirection = 3\n'
     )
     lines = run("check", puppet, robot)[1].splitlines()
-    assert lines[2] == "  motor layer: a tick every 3008 us, 332.4 Hz"
-    assert lines[3:] == [
+    assert lines[3] == "  motor layer: a tick every 3008 us, 332.4 Hz"
+    assert lines[4:] == [
         "  A  C 3    every 18022 us, written at 55.41 Hz  range 0.1..0.9, speed 4, accel 50",
         "  W  GP2/3  PWM of 20 kHz, written at 332.4 Hz   range -1..1, accel 20",
     ]
