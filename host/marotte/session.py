@@ -33,6 +33,8 @@ ATTACH_TIMEOUT_S = 2.0
 """Beyond the intervals at which outputs are attached."""
 LOOK_US = 20_000
 """How often the MCU is asked while its outputs are being attached."""
+WEIGHTS_KEPT = 64
+"""Messages with weights that wait for whoever wants them all."""
 PING_US = 100_000
 GREETING_US = 150_000
 STEP_US = 2_000
@@ -67,7 +69,7 @@ class Session:
 
     `welcome` holds the fields of the MCU's greeting. `taps` collects `(frame, taps, values_q15)` as telemetry brings
     them: the values of all DOFs, base, signal and motor one after the other as far as `taps` names them. `weights` is
-    `(frame, {action: weight_q12})` of the last weights message.
+    `(frame, {action: weight_q12})` of the last weights message, `weights_seen` has the last WEIGHTS_KEPT of them.
     """
 
     def __init__(self, carrier: Carrier):
@@ -76,6 +78,7 @@ class Session:
         self.welcome: dict[str, int] = {}
         self.taps: deque[tuple[int, int, list[int]]] = deque()
         self.weights: tuple[int, dict[int, int]] = (-1, {})
+        self.weights_seen: deque[tuple[int, dict[int, int]]] = deque(maxlen=WEIGHTS_KEPT)
         self._tables: Tables | None = None
         self._status: dict[str, int] = {}
         self._motor_status: dict[str, int] = {}
@@ -349,6 +352,7 @@ class Session:
         elif message.name == "weights":
             weights = {item["action"]: item["weight_q12"] for item in message.items}
             self.weights = (message.fields["frame"], weights)
+            self.weights_seen.append(self.weights)
         elif message.name == "status":
             self._status = message.fields
         elif message.name == "motor_status":
