@@ -210,7 +210,8 @@ def shift_levels(
                 total = 0
                 place = (k - 1) << 4
                 b = 0
-                while b < 16:
+                reach = 16 if k == 7 else 2 * k + 3
+                while b < reach:
                     total += (changes_q15[place + b] - _DELTA_ZERO) * (delta_q15[at + b] - _DELTA_ZERO)
                     b += 1
                 place = (k << 4) + d

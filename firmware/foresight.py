@@ -8,6 +8,7 @@ In a sketch, whose frames lie apart, each stands for those around it: there a fu
 way from one to the next, by `sinc^2` of the part of a cycle, and what it lacks has its mean.
 """
 
+import sys
 from array import array
 
 import micropython
@@ -124,6 +125,7 @@ def _evaluate(
     pace_q22: ptr32,
     spacing_q2: ptr16,
     fade_q15: ptr16,
+    faded_q15: ptr16,
     row_q15: ptr16,
     numerator: ptr32,
     denominator: ptr32,
@@ -131,7 +133,7 @@ def _evaluate(
     """Add every mapping of the playing actions to the sums of its DOF, but for programs and DOFs that are not processed.
 
     Functions are those of `functions.evaluate`, with the same bits; what stands in an action twice is computed once. `row` is
-    scratch, 16 values for each of an action's mappings. Bits: a shifted
+    scratch, 16 values for each of an action's mappings; `faded` is scratch for a sketch. Bits: a shifted
     weight and a value have 15 each; a pace folded to half a cycle in Q22 times a spacing of up to 127 frames in Q2 is
     below 2^30.
     """
@@ -142,6 +144,19 @@ def _evaluate(
         begin = int(first_mapping[i])
         last = begin + int(mappings[i])
         known = 0
+        if sketching:
+            u = pace_q22[n]
+            if u > 0x200000:
+                u = 0x400000 - u
+            b = 0
+            while b < frames:
+                a = 32768
+                k = int(spacing_q2[b])
+                if k:
+                    k = (u * k) >> 18
+                    a = int(fade_q15[k]) if k < 64 else 0
+                faded_q15[b] = a
+                b += 1
         m = begin
         while m < last:
             d = int(mapped_dof[m])
@@ -205,16 +220,10 @@ def _evaluate(
                             b += 1
                     if sketching:
                         if code <= _NOISE or code == _CURVE:
-                            u = pace_q22[n]
-                            if u > 0x200000:
-                                u = 0x400000 - u
                             b = 0
                             while b < frames:
-                                k = int(spacing_q2[b])
-                                if k:
-                                    k = (u * k) >> 18
-                                    a = int(fade_q15[k]) if k < 64 else 0
-                                    row_q15[row + b] = mean + (((int(row_q15[row + b]) - mean) * a + 0x4000) >> 15)
+                                a = int(row_q15[row + b]) - mean
+                                row_q15[row + b] = mean + ((a * int(faded_q15[b]) + 0x4000) >> 15)
                                 b += 1
                 low = int(low_q15[m])
                 span = int(high_q15[m]) - low
@@ -322,6 +331,11 @@ class Foresight:
     def __init__(self, sine, knots):
         """`knots` are the frames of a sketch, from the present one on."""
         self.future_q15 = halves(DOFS_MAX * BLOCK)
+        self._evaluate = _evaluate
+        if sys.platform == "rp2":
+            from firmware.foresight_thumb import evaluate
+
+            self._evaluate = evaluate
         self._sine = sine
         self._fade_q15 = fade_table(sine)
         self._spacing_q2 = halves(BLOCK)
@@ -332,6 +346,7 @@ class Foresight:
         self._shift = bytearray(DOFS_MAX)
         self._numerator = words(DOFS_MAX * BLOCK)
         self._denominator = words(DOFS_MAX * BLOCK)
+        self._faded_q15 = halves(BLOCK)
         self._row_q15 = halves(DOFS_MAX * BLOCK)
         self._value_q15 = halves(MAPPINGS_MAX)
         self._never = bytearray([255] * DOFS_MAX)
@@ -349,11 +364,12 @@ class Foresight:
             playing, found, frames, o.weight_peak_q28, t.first_mapping, t.mapping_count, t.mapped_dof, t.dofs,
             o.hold_peak_q28, o.hold_course_q28, o.hold_q15, self._weight_sum, self._shift, numerator, denominator,
         )
-        _evaluate(
+        self._evaluate(
             playing, found, frames, sketching, o.cycle_course, o.fraction_course_q24, o.weight_course_q28,
             t.first_mapping, t.mapping_count, t.mapped_dof, t.signal, t.function, t.argument, t.same, t.low_q15,
             t.high_q15, self._shift, self._sine, puppet.gradients, o.live_course_q28, t.curve_start, t.curve_samples,
-            t.curve_mean_q15, t.samples_q15, o.pace_q22, self._spacing_q2, self._fade_q15, self._row_q15, numerator,
+            t.curve_mean_q15, t.samples_q15, o.pace_q22, self._spacing_q2, self._fade_q15, self._faded_q15,
+            self._row_q15, numerator,
             denominator,
         )
         if t.programs:

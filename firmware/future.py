@@ -13,6 +13,7 @@ Source: SPEC of motion signal processing. It wants the whole future at once; the
 """
 
 import gc
+import sys
 
 import micropython
 from micropython import const
@@ -81,15 +82,6 @@ def _copy_halves(source: ptr16, target: ptr16, count: int):
         i += 1
 
 
-@micropython.viper
-def _copy_words(source: ptr32, target: ptr32, count: int):
-    """Copy words."""
-    i = 0
-    while i < count:
-        target[i] = source[i]
-        i += 1
-
-
 class Future:
     """What the bands of the next frame are, and what it takes to know that.
 
@@ -100,6 +92,12 @@ class Future:
 
     def __init__(self, sine):
         self._taps = bands.tap_table()
+        self._smooth, self._split_levels, self._bend = bands.smooth, bands.split, bands.bend
+        if sys.platform == "rp2":
+            from firmware import bands_thumb
+
+            self._taps.extend(bands_thumb.quartets(self._taps))
+            self._smooth, self._split_levels, self._bend = bands_thumb.smooth, bands_thumb.split, bands_thumb.bend
         self._changes_q15 = bands.change_table(KNOTS, 0)
         self._changes_late_q15 = bands.change_table(KNOTS, 1)
         gc.collect()  # what that took would leave holes behind
@@ -107,8 +105,9 @@ class Future:
         self._third_q15 = halves(DOFS_MAX * bands.RING)
         self.pending = False
         self.changed = False
-        self.level_q16 = words(bands.LEVELS * DOFS_MAX)
         self.foreseen_q16 = words(bands.LEVELS * DOFS_MAX)
+        self._changed_q16 = words(bands.LEVELS * DOFS_MAX)
+        self.level_q16 = self.foreseen_q16
         self._outlook = Outlook(KNOTS)
         self._foresight = Foresight(sine, KNOTS)
         self._row = bytearray(range(DOFS_MAX))
@@ -162,9 +161,10 @@ class Future:
             tables.dofs, tables.signal, BLOCK, self._foresight.future_q15, self._before_q15, self._delta_q15
         )
         bands.shift_levels(
-            tables.dofs, tables.signal, self._delta_q15, self._changes_q15, 0, self.level_q16, self.level_q16
+            tables.dofs, tables.signal, self._delta_q15, self._changes_q15, 0, self.level_q16, self._changed_q16
         )
         # fmt: on
+        self.level_q16 = self._changed_q16
         self.changed = True
 
     def _sketch(self, tables, puppet, before):
@@ -213,7 +213,7 @@ class Future:
         elif stage == 1:
             dofs = min(tables.dofs, self._dof + _BEND_DOFS)
             # fmt: off
-            bands.bend(
+            self._bend(
                 self._base_q15, self._third_q15, self._row, dofs, tables.signal, self._dof, self._bent_from,
                 self._bent_until, self._outlook.knots, self._delta_q15,
             )
@@ -228,16 +228,16 @@ class Future:
             else:
                 self._stage = 3
         else:
+            self.level_q16 = self.foreseen_q16
             if self.changed:
+                self.level_q16 = self._changed_q16
                 self._split(tables, self.level_q16)
-            else:
-                _copy_words(self.foreseen_q16, self.level_q16, bands.LEVELS * DOFS_MAX)
             self.pending = False
         return self.pending
 
     def _split(self, tables, level_q16):
         # fmt: off
-        bands.split(
+        self._split_levels(
             self._base_q15, self._third_q15, self._row, tables.dofs, tables.signal, self._frame, self._taps, level_q16
         )
         # fmt: on
@@ -278,7 +278,7 @@ class Future:
         bands.put_block(
             self._base_q15, self._row, tables.dofs, tables.signal, front, frames, self._foresight.future_q15
         )
-        bands.smooth(
+        self._smooth(
             self._base_q15, self._third_q15, self._row, tables.dofs, tables.signal, front - bands.THIRD_REACH - 1,
             frames + 1, self._scratch,
         )
@@ -345,7 +345,7 @@ class Future:
                 taken |= 1 << free
         _copy_halves(old_q15, self._before_q15, tables.dofs * BLOCK)
         for at in range(0, bands.LEVELS * DOFS_MAX, DOFS_MAX):
-            gather_words(self.level_q16, keep, scratch, tables.dofs, 0, at)
+            gather_words(self._changed_q16, keep, scratch, tables.dofs, 0, at)
             gather_words(self.foreseen_q16, keep, scratch, tables.dofs, 0, at)
         for d in range(DOFS_MAX):
             self._row[d] = rows[d]
@@ -362,6 +362,6 @@ class Future:
         for place in range(first, first + bands.RING):
             self._base_q15[place] = self._third_q15[place] = value_q15
         for at in range(dof, bands.LEVELS * DOFS_MAX, DOFS_MAX):
-            self.level_q16[at] = self.foreseen_q16[at] = (value_q15 << 1) + bands.ZERO_Q16
+            self._changed_q16[at] = self.foreseen_q16[at] = (value_q15 << 1) + bands.ZERO_Q16
         for b in range(BLOCK):
             self._before_q15[dof * BLOCK + b] = value_q15

@@ -157,6 +157,11 @@ def sketch(
         steps = 0
         at = n << 4
         b = 0
+        if x == 0 and w == 0 and turns == 255:
+            peak = g
+            while b < knots:
+                course_q28[at + b] = g << 15
+                b += 1
         while b < knots:
             stride = int(strides[b])
             while stride:
