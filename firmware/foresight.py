@@ -16,7 +16,7 @@ from micropython import const
 
 from firmware.outlook import BLOCK
 from firmware.tables import halves, words
-from shared.formats import DOFS_MAX, MAPPINGS_MAX
+from shared.formats import DOFS_MAX
 
 # As in shared.formats; viper inlines constants of its own file only.
 _RCOS = const(1)
@@ -241,45 +241,6 @@ def _evaluate(
 
 
 @micropython.viper
-def _add_programs(
-    playing: ptr8,
-    found: int,
-    b: int,
-    weight_course_q28: ptr32,
-    first_mapping: ptr16,
-    mappings: ptr8,
-    mapped_dof: ptr8,
-    signal: ptr8,
-    function: ptr8,
-    same: ptr16,
-    low_q15: ptr16,
-    high_q15: ptr16,
-    shift: ptr8,
-    value_q15: ptr16,
-    numerator: ptr32,
-    denominator: ptr32,
-):
-    """Add the programs' values of one frame of a block, `value[m]` of mapping `m`, to the sums of their DOFs."""
-    n = 0
-    while n < found:
-        i = int(playing[n])
-        m = int(first_mapping[i])
-        last = m + int(mappings[i])
-        while m < last:
-            d = int(mapped_dof[m])
-            if signal[d] and int(function[m]) == _PROGRAM:
-                low = int(low_q15[m])
-                at = int(same[m])
-                value = low + (((int(high_q15[m]) - low) * int(value_q15[at]) + 0x4000) >> 15)
-                w = weight_course_q28[(n << 4) + b] >> int(shift[d])
-                at = (d << 4) + b
-                denominator[at] = denominator[at] + w
-                numerator[at] = numerator[at] + w * value
-            m += 1
-        n += 1
-
-
-@micropython.viper
 def _divide(
     dofs: int,
     frames: int,
@@ -348,7 +309,7 @@ class Foresight:
         self._denominator = words(DOFS_MAX * BLOCK)
         self._faded_q15 = halves(BLOCK)
         self._row_q15 = halves(DOFS_MAX * BLOCK)
-        self._value_q15 = halves(MAPPINGS_MAX)
+        self._at_once = halves(BLOCK)
         self._never = bytearray([255] * DOFS_MAX)
 
     def evaluate(self, tables, outlook, frames, sketching, puppet):
@@ -373,16 +334,10 @@ class Foresight:
             denominator,
         )
         if t.programs:
-            for b in range(frames):
-                o.at_frame(b, t.lives)
-                puppet.programs.sketch(
-                    t, o, self._sine, puppet.gradients, o.live_w_q28, self._value_q15,
-                    self._spacing_q2[b] if sketching else 0, o.pace_q22, self._fade_q15,
-                )
-                _add_programs(
-                    playing, found, b, o.weight_course_q28, t.first_mapping, t.mapping_count, t.mapped_dof, t.signal,
-                    t.function, t.same, t.low_q15, t.high_q15, self._shift, self._value_q15, numerator, denominator,
-                )
+            puppet.programs.add(
+                t, o, self._sine, puppet.gradients, frames, self._spacing_q2 if sketching else self._at_once,
+                self._fade_q15, self._shift, numerator, denominator,
+            )
         _divide(
             t.dofs, frames, t.signal, self._shift, o.hold_q15, o.hold_course_q28, t.relative,
             o.turn if sketching else self._never, o.knots, numerator, denominator, self.future_q15,

@@ -291,25 +291,6 @@ def _turns(
 
 
 @micropython.viper
-def _at_frame(
-    playing: ptr8,
-    found: int,
-    b: int,
-    cycle_course: ptr16,
-    fraction_course_q24: ptr32,
-    cycle: ptr16,
-    fraction_q24: ptr32,
-):
-    """Gather the phases of one frame of a block, each to its action's own place."""
-    n = 0
-    while n < found:
-        i = int(playing[n])
-        cycle[i] = cycle_course[(n << 4) + b]
-        fraction_q24[i] = fraction_course_q24[(n << 4) + b]
-        n += 1
-
-
-@micropython.viper
 def _drift(
     lives: int,
     frames: int,
@@ -396,9 +377,8 @@ class Outlook:
         self.live_course_q28 = words(LIVES_MAX * BLOCK)
         self.pace_q22 = words(ACTIONS_MAX)
         self.turn = bytearray(DOFS_MAX)
-        self.cycle = halves(ACTIONS_MAX)  # of one frame of the block, for programs
-        self.fraction_q24 = words(ACTIONS_MAX)
-        self.live_w_q28 = words(LIVES_MAX)
+        self._nominal_cycle = halves(ACTIONS_MAX)
+        self._nominal_q24 = words(ACTIONS_MAX)
         self.knots = bytearray(knots)
         self._all = bytearray(range(BLOCK))
         self._one = bytearray([1] * BLOCK)
@@ -446,8 +426,8 @@ class Outlook:
         _copy_words(a.offset_q28, self._offset_q28, count)
         _copy_words(a.tempo_q16, self._tempo_q16, count)
         self._master_tempo_q16 = puppet.tempo_q16[0]
-        a.nominal_phases(puppet.master, tables.frame_rate_hz, self._zero_offset_q28, self._cycle, self.fraction_q24)
-        _take_phases(self.playing, self.found, self.fraction_q24, self._fraction_q30)
+        a.nominal_phases(puppet.master, tables.frame_rate_hz, self._zero_offset_q28, self._cycle, self._nominal_q24)
+        _take_phases(self.playing, self.found, self._nominal_q24, self._fraction_q30)
         target_q28, x_q28, w_q28 = puppet.live_state
         _copy_words(target_q28, self._live_target_q28, tables.lives)
         _copy_words(x_q28, self._live_x_q28, tables.lives)
@@ -554,10 +534,10 @@ class Outlook:
         live_target_q28, live_x_q28, live_w_q28 = puppet.live_state
         hold_target_q28, hold_x_q28, hold_w_q28 = puppet.hold_state
         # fmt: off
-        a.nominal_phases(puppet.master, rate_hz, self._zero_offset_q28, self.cycle, self.fraction_q24)
+        a.nominal_phases(puppet.master, rate_hz, self._zero_offset_q28, self._nominal_cycle, self._nominal_q24)
         _sketch_phases(
             a.playing, a.found, knots, self._strides, rate_hz, puppet.tempo_q16[0], a.tempo_q16, tables.warp_q26,
-            self.cycle, self.fraction_q24, a.offset_q28, self.cycle_course, self.fraction_course_q24, self.pace_q22,
+            self._nominal_cycle, self._nominal_q24, a.offset_q28, self.cycle_course, self.fraction_course_q24, self.pace_q22,
         )
         _ends(
             a.playing, a.found, knots, 1 if before else 0, 0 if before else 1, tables.cycles, a.target_q28, a.start_q18,
@@ -586,13 +566,3 @@ class Outlook:
                 live_x_q28, live_w_q28, self.live_course_q28,
             )
         # fmt: on
-
-    def at_frame(self, b, lives):
-        """Gather phases and live channels of one frame of the block in `cycle`, `fraction_q24` and `live_w_q28`."""
-        # fmt: off
-        _at_frame(
-            self.playing, self.found, b, self.cycle_course, self.fraction_course_q24, self.cycle, self.fraction_q24
-        )
-        # fmt: on
-        for live in range(lives):
-            self.live_w_q28[live] = self.live_course_q28[live * BLOCK + b]
