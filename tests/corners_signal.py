@@ -4,6 +4,7 @@ Like `tests.corners`, with band gains within `reach` of 0. All are valid, last `
 frame `LAST_NEWS`, so that they come to rest.
 """
 
+import math
 import random
 
 from tests.corners import Corner
@@ -22,6 +23,7 @@ def signal_corners(reach):
         _gains_in_every_frame,
         _ends_of_gestures_in_sight,
         _flat_and_back,
+        _news_just_before_flat,
         _fastest_wiggle,
         _slowest_sway,
         _wheels_turning_round,
@@ -158,6 +160,22 @@ def _flat_and_back(reach):
         {"frame": 330, "gains": _ends(reach)},
     ]
     return "flat and back", _puppet(actions), cues
+
+
+def _news_just_before_flat(reach):
+    """Gains come to 1 in the frame after one that brings news: of what that adds to the offset nothing may be left."""
+    actions = {
+        "POSE": {"tau": 0.5, "map": [["NECK", 0, 1, "const(1)"]]},
+        "BACK": {"map": [["NECK", 1, 0, "const(1)"]]},
+    }
+    # From `reach` on, differences fall by exp(-1 / 7.5) in each frame, to 2^-10.
+    arrival = 60 + math.ceil(7.5 * math.log((reach - 1) * 1024)) - 1
+    cues = [
+        {"frame": 0, "weights": {"BACK": 1}, "gains": [1, 1, *[reach] * 5]},
+        {"frame": 60, "gains": [1] * 7},
+        {"frame": arrival - 1, "weights": {"POSE": 4}},
+    ]
+    return "news just before flat", _puppet(actions), cues
 
 
 def _fastest_wiggle(reach):
