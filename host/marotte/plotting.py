@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from marotte.bands import centres_hz, hertz
 from marotte.errors import MarotteError
@@ -54,15 +54,25 @@ TITLE = 0.3
 AXIS = 0.55
 WEIGHT_ROW = 0.23
 LINE = 0.175
+LIST_INDENT = 0.35
+LIST_WIDTH = 3.55
 CUES_MOST = 60
-"""More cues than that are only counted."""
+"""More cues than that are only counted, and their lines are thinner."""
+LEVELS_MOST = 4
+"""Rows of cues' numbers above the time; a number that would need one more is in the list only."""
+COLUMNS = 3
+"""Of a list of cues that is too long to stand beside the weights."""
 NAME_MOST = 24
 SPECTRUM_DECADES = 3.5
 BINS_PER_OCTAVE = 6
 SPAN_LEAST = 0.02
-AMPLITUDE_LEAST = 0.001
+AMPLITUDE_LEAST = 0.03
 AMPLITUDE_NONE = 1e-9
 """What the axes of a DOF that hardly moves show at least; a logarithmic axis has no 0."""
+
+
+Listed: TypeAlias = list[list[tuple[str, str]]]
+"""Lines cue by cue: what stands before a line, and the line."""
 
 
 class PlotError(MarotteError):
@@ -171,19 +181,23 @@ class _Drawing:
         self.rate_hz = rendering.puppet.frame_rate_hz
         self.end_s = len(rendering.frames) / self.rate_hz
         self.cues = cues
+        self.cue_width = 0.8 if len(cues) <= CUES_MOST else 0.3
         weights = {name: values for name, values in rendering.weights.items() if any(values)}
         self.left = max([0.75, *(MARGIN + 0.12 + text_width(_short(name)) for name in weights)])
         self.time_width = TIME_WIDTH - (self.left - 0.75)
         self.right = self.left + self.time_width + GAP
         self.spectrum_width = WIDTH - MARGIN - self.right
         levels = self.cue_levels()
-        strip = STRIP_ROW * (max(levels, default=0) + 1)
-        lines = self.cue_lines()
+        strip = STRIP_ROW * (max((level for level in levels if level is not None), default=0) + 1)
+        listed = self.cue_lines()
         weights_height = TITLE + WEIGHT_ROW * len(weights) if weights else 0.0
-        list_height = TITLE + LINE * len(lines) if lines else 0.0
-        rows = len(dofs) * (ROW + TITLE)
-        below = max(weights_height, list_height)
-        self.height = MARGIN + HEADER + strip + rows + below + AXIS + MARGIN
+        rows = MARGIN + HEADER + strip + len(dofs) * (ROW + TITLE)
+        lines = sum(map(len, listed))
+        is_beside = AXIS + TITLE + LINE * lines <= weights_height + AXIS
+        columns = [listed] if is_beside else _columns(listed)
+        list_height = TITLE + LINE * max(sum(map(len, column)) for column in columns) if listed else 0.0
+        list_top = rows + AXIS if is_beside else rows + weights_height + AXIS
+        self.height = max(rows + weights_height + AXIS, list_top + list_height) + MARGIN
         self.figure = Figure(figsize=(WIDTH, self.height))
         self.header()
         top = MARGIN + HEADER
@@ -196,7 +210,9 @@ class _Drawing:
             top += ROW + TITLE
         if weights:
             self.weights(weights, top + TITLE)
-        self.cue_list(lines, top + AXIS + 0.1)
+        for place, column in enumerate(columns):
+            left = self.right - GAP + 0.3 if is_beside else MARGIN + place * (WIDTH - 2 * MARGIN) / COLUMNS
+            self.cue_list(column, left, list_top + 0.1, has_title=place == 0)
 
     def axes(self, left: float, top: float, width: float, height: float) -> Axes:
         """Return axes at a place, in inches from the left and from the top."""
@@ -238,21 +254,24 @@ class _Drawing:
             labelcolor=INK,
         )
 
-    def cue_levels(self) -> list[int]:
-        """Return for each cue the row in which its number stands, so that no two touch."""
+    def cue_levels(self) -> list[int | None]:
+        """Return for each cue the row in which its number stands, so that no two touch; None where there is no room."""
         ends: list[float] = []
-        levels = []
+        levels: list[int | None] = []
         for cue in self.cues if len(self.cues) <= CUES_MOST else ():
             at = cue.at_s / self.end_s * self.time_width
             half = text_width(str(cue.number)) / 2 + 0.03
             level = next((level for level, end in enumerate(ends) if at - half >= end), len(ends))
-            ends[level : level + 1] = [at + half]
-            levels.append(level)
+            if level < LEVELS_MOST:
+                ends[level : level + 1] = [at + half]
+            levels.append(level if level < LEVELS_MOST else None)
         return levels
 
-    def strip(self, top: float, height: float, levels: list[int]) -> None:
+    def strip(self, top: float, height: float, levels: list[int | None]) -> None:
         """Write the numbers of the cues above the time."""
         for cue, level in zip(self.cues, levels, strict=False):
+            if level is None:
+                continue
             left = self.left + cue.at_s / self.end_s * self.time_width
             self.text(left, top + height - STRIP_ROW * (level + 1), str(cue.number), SMALL_PT, ha="center")
 
@@ -264,7 +283,7 @@ class _Drawing:
         if has_time:
             axes.set_xlabel("time (s)", fontsize=SMALL_PT, color=INK)
         for cue in self.cues:
-            axes.axvline(cue.at_s, color=CUE, linewidth=0.8, zorder=0)
+            axes.axvline(cue.at_s, color=CUE, linewidth=self.cue_width, zorder=0)
         return axes
 
     def dof(self, name: str, top: float, is_first: bool, has_time: bool) -> None:
@@ -273,7 +292,9 @@ class _Drawing:
         axes = self.time_axes(top, ROW, has_time)
         if is_first:  # the lines of the cues go up to their numbers
             for cue in self.cues:
-                axes.axvline(cue.at_s, 1, 1 + (TITLE - 0.02) / ROW, color=CUE, linewidth=0.8, zorder=0, clip_on=False)
+                axes.axvline(
+                    cue.at_s, 1, 1 + (TITLE - 0.02) / ROW, color=CUE, linewidth=self.cue_width, zorder=0, clip_on=False
+                )
         title = axes.set_title(_short(name), loc="left", fontsize=MEDIUM_PT, fontweight="bold", color=INK, pad=4)
         title.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 1})
         taps = {"base": rendering.base[name], "signal": rendering.signal[name], "motor": rendering.motor[name]}
@@ -336,26 +357,24 @@ class _Drawing:
         axes.set_yticks(places, [_short(name) for name in weights])
         axes.tick_params(axis="y", length=0)
 
-    def cue_lines(self) -> list[tuple[str, str]]:
-        """Return the lines of the list of cues: what stands before a line, and the line."""
+    def cue_lines(self) -> Listed:
+        """Return the lines of the list of cues, cue by cue: what stands before a line, and the line."""
         if len(self.cues) > CUES_MOST:
-            return [("", f"{len(self.cues)} cues")]
-        room = self.spectrum_width + GAP - 0.3 - _CUE_INDENT
-        lines = []
+            return [[("", f"{len(self.cues)}, too many to be listed")]]
+        cues = []
         for cue in self.cues:
-            first, *more = _wrapped(cue.text, room)
-            lines += [(f"{cue.number}", f"{cue.at_s:.4g} s  {first}"), *(("", "    " + line) for line in more)]
-        return lines
+            first, *more = _wrapped(cue.text, LIST_WIDTH)
+            cues.append([(f"{cue.number}", f"{cue.at_s:.4g} s  {first}"), *(("", "    " + line) for line in more)])
+        return cues
 
-    def cue_list(self, lines: list[tuple[str, str]], top: float) -> None:
-        """Write the list of cues at the right of the weights."""
-        if lines:
-            left = self.right - GAP + 0.3
+    def cue_list(self, cues: Listed, left: float, top: float, has_title: bool) -> None:
+        """Write the list of cues, or a column of it."""
+        if cues and has_title:
             self.text(left, top, "cues", MEDIUM_PT)
-            for place, (number, line) in enumerate(lines):
-                line_top = top + TITLE + LINE * place
-                self.text(left + _CUE_INDENT - 0.12, line_top, number, SMALL_PT, ha="right")
-                self.text(left + _CUE_INDENT, line_top, line, SMALL_PT)
+        for place, (number, line) in enumerate(line for cue in cues for line in cue):
+            line_top = top + TITLE + LINE * place
+            self.text(left + LIST_INDENT - 0.12, line_top, number, SMALL_PT, ha="right")
+            self.text(left + LIST_INDENT, line_top, line, SMALL_PT)
 
 
 _LINES: dict[str, dict[str, Any]] = {
@@ -363,7 +382,6 @@ _LINES: dict[str, dict[str, Any]] = {
     "signal": {"color": SIGNAL, "linewidth": 1.5},
     "motor": {"color": MOTOR, "linewidth": 1.0},
 }
-_CUE_INDENT = 0.35
 
 
 def text_width(text: str, size_pt: float = SMALL_PT) -> float:
@@ -378,13 +396,32 @@ def _wrapped(text: str, room: float) -> list[str]:
     room -= text_width("00.00 s  ")
     lines: list[str] = []
     for part in text.split(", "):
-        while text_width(part) > room:
-            part = part[:-2] + "…"
+        part = _cut(part, room)
         if lines and text_width(f"{lines[-1]}, {part},") <= room:
             lines[-1] += ", " + part
         else:
             lines[-1:] = [lines[-1] + ",", part] if lines else [part]
     return lines
+
+
+def _cut(part: str, room: float) -> str:
+    """Return a name and its number with the name cut so that both have room."""
+    name, _, number = part.rpartition(" ")
+    while text_width(part) > room and name:
+        name = name[:-1]
+        part = f"{name}… {number}"
+    return part
+
+
+def _columns(cues: Listed) -> list[Listed]:
+    """Return the list of cues in columns of about equal length, no cue in two of them."""
+    most = max(-(-sum(map(len, cues)) // COLUMNS), 1)
+    columns: list[Listed] = [[] for _ in range(COLUMNS)]
+    lines = 0
+    for cue in cues:
+        columns[min(lines // most, COLUMNS - 1)].append(cue)
+        lines += len(cue)
+    return columns
 
 
 def _short(name: str) -> str:

@@ -123,6 +123,17 @@ def test_figure_marks_the_cues_within_it_and_lists_them():
     assert not any("TOO_LATE" in text for text in written)
 
 
+@pytest.mark.parametrize(("actions", "is_beside"), [(2, False), (20, True)])
+def test_figure_lists_the_cues_beside_the_weights_or_in_columns_below_them(actions, is_beside):
+    rendering = rendering_of(weights=[f"A{number}" for number in range(actions)])
+    figure = plot(rendering, Score(SCORE.cues[:4]), ["SWAY"])
+    box = axes_titled(figure, "weights (a full row is 2.49)").get_position()
+    (line,) = (text for text in figure.texts if text.get_text() == "0 s  CALM, NOD 2")
+    left, top = line.get_position()
+    assert (left > box.x1 and top > box.y0) == is_beside
+    assert (top < box.y0) == (not is_beside)
+
+
 def test_figure_has_spectra_with_the_bands_marked():
     figure = plot(rendering_of(), None, ["SWAY"])
     (axes,) = (axes for axes in figure.axes if axes.get_xscale() == "log")
