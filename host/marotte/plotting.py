@@ -12,20 +12,20 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from marotte.bands import centres_hz, hertz
+from marotte.cue_list import Listed, NumberedCue, in_columns, numbered
 from marotte.errors import MarotteError
-from marotte.puppet import NEUTRAL_GAINS, Puppet
+from marotte.spectrum import spectrum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from marotte.rendering import Rendering
-    from marotte.score import Cue, Score
+    from marotte.score import Score
 
 SUFFIXES = (".png", ".svg")
 DOFS = 4
@@ -64,15 +64,10 @@ COLUMNS = 3
 """Of a list of cues that is too long to stand beside the weights."""
 NAME_MOST = 24
 SPECTRUM_DECADES = 3.5
-BINS_PER_OCTAVE = 6
 SPAN_LEAST = 0.02
 AMPLITUDE_LEAST = 0.03
 AMPLITUDE_NONE = 1e-9
 """What the axes of a DOF that hardly moves show at least; a logarithmic axis has no 0."""
-
-
-Listed: TypeAlias = list[list[tuple[str, str]]]
-"""Lines cue by cue: what stands before a line, and the line."""
 
 
 class PlotError(MarotteError):
@@ -96,7 +91,7 @@ def plot(rendering: Rendering, score: Score | None = None, dofs: Sequence[str] |
     for name in names:
         if name not in rendering.base:
             raise KeyError(name)
-    return _Drawing(rendering, _numbered(score, rendering), names).figure
+    return _Drawing(rendering, numbered(score, rendering.puppet, len(rendering.frames)), names).figure
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
@@ -123,58 +118,10 @@ def moving(rendering: Rendering) -> list[str]:
     return [name for name in spans if name in most]
 
 
-def spectrum(values: Sequence[float], rate_hz: float) -> tuple[list[float], list[float]]:
-    """Return frequencies in Hz and the amplitudes there, those of a sixth of an octave each put together.
-
-    The mean is taken away and a Hann window applied. The sum of the squares is that of the motion. A sine of amplitude `a` gives
-    `a` at its frequency, or somewhat less where a sixth of an octave is narrower than the window's three lines.
-    """
-    import numpy as np
-
-    count = len(values)
-    window = np.hanning(count + 1)[:-1]
-    total = window.sum()
-    if total == 0:
-        return [], []
-    lines = np.abs(np.fft.rfft((np.asarray(values) - np.mean(values)) * window))[1:] * 2 / total
-    lines /= (
-        math.sqrt(count * np.square(window).sum()) / total
-    )  # a line of the motion is seen in several of the spectrum
-    frequencies = np.fft.rfftfreq(count, 1 / rate_hz)[1:]
-    bins = np.round(np.log2(frequencies * count / rate_hz) * BINS_PER_OCTAVE)
-    centres = [float(np.exp(np.log(frequencies[bins == each]).mean())) for each in np.unique(bins)]
-    amplitudes = [float(np.sqrt(np.square(lines[bins == each]).sum())) for each in np.unique(bins)]
-    return centres, amplitudes
-
-
-@dataclass(frozen=True)
-class _Numbered:
-    """A cue as the figure has it."""
-
-    number: int
-    at_s: float
-    text: str
-
-
-def _numbered(score: Score | None, rendering: Rendering) -> list[_Numbered]:
-    """Return the cues within a rendering, in order."""
-    cues = sorted(score.cues, key=lambda cue: cue.at_s) if score else []
-    within = [cue for cue in cues if cue.frame(rendering.puppet.frame_rate_hz) < len(rendering.frames)]
-    return [_Numbered(n + 1, float(cue.at_s), _cue_text(cue, rendering.puppet)) for n, cue in enumerate(within)]
-
-
-def _cue_text(cue: Cue, puppet: Puppet) -> str:
-    """Return what a cue does, and what its mood makes of the gains."""
-    gains = puppet.moods[cue.mood].gains if cue.mood is not None and cue.gains is None else None
-    if gains is None or gains == NEUTRAL_GAINS:
-        return cue.summary()
-    return f"{cue.summary()} (gains {' '.join(f'{gain:g}' for gain in gains)})"
-
-
 class _Drawing:
     """A figure in the making, from its top downwards."""
 
-    def __init__(self, rendering: Rendering, cues: list[_Numbered], dofs: list[str]) -> None:
+    def __init__(self, rendering: Rendering, cues: list[NumberedCue], dofs: list[str]) -> None:
         from matplotlib.figure import Figure
 
         self.rendering = rendering
@@ -194,7 +141,7 @@ class _Drawing:
         rows = MARGIN + HEADER + strip + len(dofs) * (ROW + TITLE)
         lines = sum(map(len, listed))
         is_beside = AXIS + TITLE + LINE * lines <= weights_height + AXIS
-        columns = [listed] if is_beside else _columns(listed)
+        columns = [listed] if is_beside else in_columns(listed, COLUMNS)
         list_height = TITLE + LINE * max(sum(map(len, column)) for column in columns) if listed else 0.0
         list_top = rows + AXIS if is_beside else rows + weights_height + AXIS
         self.height = max(rows + weights_height + AXIS, list_top + list_height) + MARGIN
@@ -358,14 +305,10 @@ class _Drawing:
         axes.tick_params(axis="y", length=0)
 
     def cue_lines(self) -> Listed:
-        """Return the lines of the list of cues, cue by cue: what stands before a line, and the line."""
+        """Return the list of cues."""
         if len(self.cues) > CUES_MOST:
             return [[("", f"{len(self.cues)}, too many to be listed")]]
-        cues = []
-        for cue in self.cues:
-            first, *more = _wrapped(cue.text, LIST_WIDTH)
-            cues.append([(f"{cue.number}", f"{cue.at_s:.4g} s  {first}"), *(("", "    " + line) for line in more)])
-        return cues
+        return [cue.lines(LIST_WIDTH, text_width) for cue in self.cues]
 
     def cue_list(self, cues: Listed, left: float, top: float, has_title: bool) -> None:
         """Write the list of cues, or a column of it."""
@@ -389,39 +332,6 @@ def text_width(text: str, size_pt: float = SMALL_PT) -> float:
     from matplotlib.textpath import TextPath
 
     return TextPath((0, 0), text, size=size_pt).get_extents().width / 72 if text.strip() else 0.0
-
-
-def _wrapped(text: str, room: float) -> list[str]:
-    """Return a text in lines that are no wider than there is room, in inches, broken at its commas."""
-    room -= text_width("00.00 s  ")
-    lines: list[str] = []
-    for part in text.split(", "):
-        part = _cut(part, room)
-        if lines and text_width(f"{lines[-1]}, {part},") <= room:
-            lines[-1] += ", " + part
-        else:
-            lines[-1:] = [lines[-1] + ",", part] if lines else [part]
-    return lines
-
-
-def _cut(part: str, room: float) -> str:
-    """Return a name and its number with the name cut so that both have room."""
-    name, _, number = part.rpartition(" ")
-    while text_width(part) > room and name:
-        name = name[:-1]
-        part = f"{name}… {number}"
-    return part
-
-
-def _columns(cues: Listed) -> list[Listed]:
-    """Return the list of cues in columns of about equal length, no cue in two of them."""
-    most = max(-(-sum(map(len, cues)) // COLUMNS), 1)
-    columns: list[Listed] = [[] for _ in range(COLUMNS)]
-    lines = 0
-    for cue in cues:
-        columns[min(lines // most, COLUMNS - 1)].append(cue)
-        lines += len(cue)
-    return columns
 
 
 def _short(name: str) -> str:

@@ -12,10 +12,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from marotte import plotting
 from marotte.errors import MarotteError
-from marotte.plotting import PlotError, moving, plot, save_figure, spectrum
+from marotte.plotting import PlotError, moving, plot, save_figure
 from marotte.puppet import Dof, Mood, Puppet
 from marotte.rendering import Rendering
 from marotte.score import Cue, Score
+from marotte.spectrum import spectrum
 
 LONG = "AN_ACTION_WITH_AN_EXTREMELY_LONG_NAME"
 NAMES = ("SWAY", "A_DOF", "WHEEL", "STILL", "SLOW", "LAST")
