@@ -92,6 +92,7 @@ def _put(
 @micropython.viper
 def _apply(
     frame: int,
+    consume: int,
     count: int,
     queue_frame: ptr32,
     queue_kind: ptr8,
@@ -104,7 +105,7 @@ def _apply(
     gain4_q16: ptr32,
     counts: ptr32,
 ) -> int:
-    """Let all targets stamped `frame` or earlier act; return how many wait.
+    """Let all targets stamped `frame` or earlier act; return how many wait: without `consume` all of them, and none is late.
 
     `counts[0]` counts the late ones, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]` gets a bit
     per live channel whose target acted.
@@ -115,7 +116,7 @@ def _apply(
         if queue_frame[n] <= frame:
             kind = int(queue_kind[n])
             if kind < 128:
-                if queue_frame[n] < frame:
+                if queue_frame[n] < frame and consume:
                     counts[0] = counts[0] + 1
             kind = kind & 127
             index = int(queue_index[n])
@@ -133,7 +134,7 @@ def _apply(
                 else:
                     action_tempo_q16[index] = queue_value[n]
                     counts[1] = counts[1] + 1
-        else:
+        elif consume:
             if kept != n:
                 queue_frame[kept] = queue_frame[n]
                 queue_kind[kept] = queue_kind[n]
@@ -141,7 +142,18 @@ def _apply(
                 queue_value[kept] = queue_value[n]
             kept += 1
         n += 1
-    return kept
+    return kept if consume else count
+
+
+@micropython.viper
+def _is_news(frame: int, count: int, queue_frame: ptr32, queue_kind: ptr8) -> int:
+    """Return 1 if a target of anything but a gain will act in `frame`, else 0."""
+    n = 0
+    while n < count:
+        if queue_frame[n] <= frame and (int(queue_kind[n]) & 127) != GAIN:
+            return 1
+        n += 1
+    return 0
 
 
 @micropython.viper
@@ -192,12 +204,13 @@ class Cues:
 
     `counts[0]` counts targets that came after their frame and acted at once, `counts[1]` tempos of actions that acted.
     `counts[2]` counts the targets of the last frame that change what is to come, that is all but gains; `counts[3]` has a
-    bit per live channel that got a target in it. `detail` explains the last refusal: the number of the bad field, or the
+    bit per live channel that got a target in it. `arrivals` moves on with every payload that is queued. `detail` explains the last refusal: the number of the bad field, or the
     free places.
     """
 
     def __init__(self):
         self.count = 0
+        self.arrivals = 0
         self.detail = 0
         self.counts = array("i", (0, 0, 0, 0))
         self._frame = array("i", bytes(4 * QUEUE_MAX))
@@ -247,16 +260,28 @@ class Cues:
             self.detail = bad
             return messages.RANGE
         self.count += items
+        self.arrivals = (self.arrivals + 1) & 0xFFFF
         return messages.OK
 
-    def apply(self, frame, weight_target_q28, live_target_q28, tempo_q16, action_tempo_q16, gain4_q16):
-        """Let the targets due in `frame` act on the arrays; `tempo_q16[0]` is the master tempo."""
+    def has_news(self, frame):
+        """Return whether anything will act in `frame` that changes what is to come."""
+        return self.count != 0 and _is_news(frame, self.count, self._frame, self._kind) != 0
+
+    # fmt: off
+    def apply(
+        self, frame, weight_target_q28, live_target_q28, tempo_q16, action_tempo_q16, gain4_q16, consume=True
+    ):
+        # fmt: on
+        """Let the targets due in `frame` act on the arrays; `tempo_q16[0]` is the master tempo.
+
+        Without `consume` they stay in the queue, to act again.
+        """
         self.counts[2] = self.counts[3] = 0
         if self.count == 0:
             return
         # fmt: off
         self.count = _apply(
-            frame, self.count, self._frame, self._kind, self._index, self._value,
+            frame, 1 if consume else 0, self.count, self._frame, self._kind, self._index, self._value,
             weight_target_q28, live_target_q28, tempo_q16, action_tempo_q16, gain4_q16, self.counts,
         )
         # fmt: on

@@ -18,8 +18,8 @@ What the target will do in frames to come is then, from the last target on, `v =
 Three numbers per channel come with the tables. `process_q16` is `q`, the variance of what a frame adds to the velocity,
 and `noise_q16` is `r`, the variance of a reading, both in one unit, with 16 binary places, that the host chooses per
 channel: only their ratio counts, and P has the same unit. 1 <= noise <= 2^27, 0 <= process <= 2^27. The unit should be
-such that P11 stays below 2^28 in the longest silence; where an element of P would pass that, P stays as it is for a
-frame, so that nothing overflows whatever the numbers are. `fade_q15` is `exp(-1 / (F * fade))`, below 1.
+such that P11 stays below 2^28 in the longest silence; where it would pass that, P stays as it is for a frame, so that
+nothing overflows whatever the numbers are. `fade_q15` is `exp(-1 / (F * fade))`, below 1.
 
 Source: SPEC of motion signal processing (`predict`); the textbook's filter with white noise as acceleration. The fading in
 silence is ours.
@@ -55,9 +55,10 @@ def _estimate(
 
     `arrived` has the bit of each channel that got a target in this frame. Targets and positions are Q28 in 0..1, velocities per
     frame within -1..1 with 1 added. `covariance` holds 3 x 16 words, P11, P12 and P22; none is ever negative.
-    Bits: elements of P have 29, their sums 31; P11 + r has 30 and is divided by with 15; gains are Q22 up to 3/2
-    (what goes to P12 goes to P11 too, but for the process, of which P12 gets 1/2 and P11 1/3), 23 bits in limbs of 12 + 11;
-    the innovation stays within 2^29, in limbs of 15 + 15. Products of limbs stay below 2^27, and 2^30 when shifted.
+    Bits: P11 stays within 2^28, P12 and P22 within that and 2/3 of the process, as what they get P11 gets too; their sum
+    has 31; P11 + r has 30 and is divided by with 15; gains are Q22 up to 3/2 (what goes to P12 goes to P11 too, but for
+    the process, of which P12 gets 1/2 and P11 1/3), 23 bits in limbs of 12 + 11; the innovation stays within 2^29, in
+    limbs of 15 + 15. Products of limbs stay below 2^27, and 2^30 when shifted.
     """
     i = 0
     while i < lives:
@@ -89,7 +90,7 @@ def _estimate(
             next11 += q // 3
             next12 += q >> 1
             next22 += q
-            if next11 <= _COVARIANCE_MAX and next12 <= _COVARIANCE_MAX and next22 <= _COVARIANCE_MAX:
+            if next11 <= _COVARIANCE_MAX:
                 p11 = next11
                 p12 = next12
                 p22 = next22
@@ -194,6 +195,13 @@ class Kalman:
             tables.live_fade_q15, self._position_q28, self.velocity_q28, self._covariance_q16,
         )
         # fmt: on
+
+    def is_moving(self, lives):
+        """Return whether any of so many channels is known to move."""
+        for live in range(lives):
+            if self.velocity_q28[live] != ZERO_Q28:
+                return True
+        return False
 
     def rearrange(self, gather_words, keep, scratch, tables):
         """Let other tables have other channels; those that were not there before stand at their rest."""

@@ -183,6 +183,7 @@ class Tables:
         # curves, programs, blinks
         self.curve_start = halves(CURVES_MAX)
         self.curve_samples = halves(CURVES_MAX)
+        self.curve_mean_q15 = halves(CURVES_MAX)
         self.samples_q15 = halves(SAMPLES_POOL)
         self.program_start = halves(isa.PROGRAMS_MAX)
         self.program_words = halves(isa.PROGRAMS_MAX)
@@ -564,6 +565,8 @@ class Tables:
         self.samples_q15[self._samples_used] = value_q15
         self._samples_used += 1
         if self._samples_used == self._samples_end:
+            samples = self.samples_q15[self.curve_start[self._curves_seen] : self._samples_end]
+            self.curve_mean_q15[self._curves_seen] = (sum(samples) + len(samples) // 2) // len(samples)
             self._curves_seen += 1
         return None
 

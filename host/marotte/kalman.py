@@ -28,10 +28,10 @@ class Kalman:
 
     noise: float = 0.005
     """Standard deviation of a reading, in units of the channel (0..1): tremor and the steps of the stick's converter."""
-    agility: float = 2.0
+    agility: float = 3.0
     """How much the stick's velocity changes in a second, as a standard deviation, in units a second: more follows quicker and
     trembles more."""
-    fade_s: float = 0.1
+    fade_s: float = 0.08
     """Time constant with which the velocity dies out, in what is predicted and while nothing arrives."""
 
 
