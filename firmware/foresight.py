@@ -110,6 +110,7 @@ def _evaluate(
     signal: ptr8,
     function: ptr8,
     argument: ptr16,
+    same: ptr16,
     low_q15: ptr16,
     high_q15: ptr16,
     shift: ptr8,
@@ -129,7 +130,8 @@ def _evaluate(
 ):
     """Add every mapping of the playing actions to the sums of its DOF, but for programs and DOFs that are not processed.
 
-    Functions are those of `functions.evaluate`, with the same bits. `row` is scratch, 16 values of one mapping. Bits: a shifted
+    Functions are those of `functions.evaluate`, with the same bits; what stands in an action twice is computed once. `row` is
+    scratch, 16 values for each of an action's mappings. Bits: a shifted
     weight and a value have 15 each; a pace folded to half a cycle in Q22 times a spacing of up to 127 frames in Q2 is
     below 2^30.
     """
@@ -137,77 +139,83 @@ def _evaluate(
     while n < found:
         i = int(playing[n])
         first = n << 4
-        m = int(first_mapping[i])
-        last = m + int(mappings[i])
+        begin = int(first_mapping[i])
+        last = begin + int(mappings[i])
+        known = 0
+        m = begin
         while m < last:
             d = int(mapped_dof[m])
             code = int(function[m])
             if signal[d] and code < _PROGRAM:
-                b = 0
-                mean = 16384
-                if code <= _RCOS:
-                    ahead = code << 22
-                    while b < frames:
-                        angle = (fraction_course_q24[first + b] + ahead) & 0xFFFFFF
-                        k = angle >> 15
-                        a = int(sine[k])
-                        row_q15[b] = a + (((int(sine[k + 1]) - a) * (angle & 0x7FFF) + 0x4000) >> 15)
-                        b += 1
-                elif code == _NOISE:
-                    k = int(argument[m]) << 8
-                    while b < frames:
-                        j = int(cycle_course[first + b])
-                        u = (fraction_course_q24[first + b] + 0x100) >> 9
-                        v = 32768 - u
-                        g = int(gradients[k + (j & 255)]) - 32768
-                        g_next = int(gradients[k + ((j + 1) & 255)]) - 32768
-                        slope = (g * v - g_next * u + 0x4000) >> 15
-                        row_q15[b] = 16384 + ((((u * v + 0x2000) >> 14) * slope + 0x4000) >> 15)
-                        b += 1
-                elif code == _LIVE:
-                    j = int(argument[m]) << 4
-                    while b < frames:
-                        a = (live_course_q28[j + b] + 0x1000) >> 13
-                        if a > 32768:
-                            a = 32768
-                        row_q15[b] = a
-                        b += 1
-                elif code == _CURVE:
-                    k = int(argument[m])
-                    samples = int(curve_samples[k])
-                    mean = int(curve_mean_q15[k])
-                    k = int(curve_start[k])
-                    while b < frames:
-                        u = ((fraction_course_q24[first + b] + 2) >> 2) * samples
-                        j = u >> 22
-                        if j >= samples:
-                            j = 0
-                            u = 0
-                        u = (u & 0x3FFFFF) >> 7
-                        a = int(samples_q15[k + j])
-                        j += 1
-                        if j == samples:
-                            j = 0
-                        row_q15[b] = a + (((int(samples_q15[k + j]) - a) * u + 0x4000) >> 15)
-                        b += 1
-                else:
-                    a = int(argument[m])
-                    while b < frames:
-                        row_q15[b] = a
-                        b += 1
-                if sketching:
-                    if code <= _NOISE or code == _CURVE:
-                        u = pace_q22[n]
-                        if u > 0x200000:
-                            u = 0x400000 - u
-                        b = 0
+                k = int(same[m]) - begin
+                row = k << 4
+                if (known >> k) & 1 == 0:
+                    known = known | (1 << k)
+                    b = 0
+                    mean = 16384
+                    if code <= _RCOS:
+                        ahead = code << 22
                         while b < frames:
-                            k = int(spacing_q2[b])
-                            if k:
-                                k = (u * k) >> 18
-                                a = int(fade_q15[k]) if k < 64 else 0
-                                row_q15[b] = mean + (((int(row_q15[b]) - mean) * a + 0x4000) >> 15)
+                            angle = (fraction_course_q24[first + b] + ahead) & 0xFFFFFF
+                            k = angle >> 15
+                            a = int(sine[k])
+                            row_q15[row + b] = a + (((int(sine[k + 1]) - a) * (angle & 0x7FFF) + 0x4000) >> 15)
                             b += 1
+                    elif code == _NOISE:
+                        k = int(argument[m]) << 8
+                        while b < frames:
+                            j = int(cycle_course[first + b])
+                            u = (fraction_course_q24[first + b] + 0x100) >> 9
+                            v = 32768 - u
+                            g = int(gradients[k + (j & 255)]) - 32768
+                            g_next = int(gradients[k + ((j + 1) & 255)]) - 32768
+                            slope = (g * v - g_next * u + 0x4000) >> 15
+                            row_q15[row + b] = 16384 + ((((u * v + 0x2000) >> 14) * slope + 0x4000) >> 15)
+                            b += 1
+                    elif code == _LIVE:
+                        j = int(argument[m]) << 4
+                        while b < frames:
+                            a = (live_course_q28[j + b] + 0x1000) >> 13
+                            if a > 32768:
+                                a = 32768
+                            row_q15[row + b] = a
+                            b += 1
+                    elif code == _CURVE:
+                        k = int(argument[m])
+                        samples = int(curve_samples[k])
+                        mean = int(curve_mean_q15[k])
+                        k = int(curve_start[k])
+                        while b < frames:
+                            u = ((fraction_course_q24[first + b] + 2) >> 2) * samples
+                            j = u >> 22
+                            if j >= samples:
+                                j = 0
+                                u = 0
+                            u = (u & 0x3FFFFF) >> 7
+                            a = int(samples_q15[k + j])
+                            j += 1
+                            if j == samples:
+                                j = 0
+                            row_q15[row + b] = a + (((int(samples_q15[k + j]) - a) * u + 0x4000) >> 15)
+                            b += 1
+                    else:
+                        a = int(argument[m])
+                        while b < frames:
+                            row_q15[row + b] = a
+                            b += 1
+                    if sketching:
+                        if code <= _NOISE or code == _CURVE:
+                            u = pace_q22[n]
+                            if u > 0x200000:
+                                u = 0x400000 - u
+                            b = 0
+                            while b < frames:
+                                k = int(spacing_q2[b])
+                                if k:
+                                    k = (u * k) >> 18
+                                    a = int(fade_q15[k]) if k < 64 else 0
+                                    row_q15[row + b] = mean + (((int(row_q15[row + b]) - mean) * a + 0x4000) >> 15)
+                                b += 1
                 low = int(low_q15[m])
                 span = int(high_q15[m]) - low
                 places = int(shift[d])
@@ -216,7 +224,7 @@ def _evaluate(
                 while b < frames:
                     w = weight_course_q28[first + b] >> places
                     denominator[at] = denominator[at] + w
-                    numerator[at] = numerator[at] + w * (low + ((span * int(row_q15[b]) + 0x4000) >> 15))
+                    numerator[at] = numerator[at] + w * (low + ((span * int(row_q15[row + b]) + 0x4000) >> 15))
                     at += 1
                     b += 1
             m += 1
@@ -324,7 +332,7 @@ class Foresight:
         self._shift = bytearray(DOFS_MAX)
         self._numerator = words(DOFS_MAX * BLOCK)
         self._denominator = words(DOFS_MAX * BLOCK)
-        self._row_q15 = halves(BLOCK)
+        self._row_q15 = halves(DOFS_MAX * BLOCK)
         self._value_q15 = halves(MAPPINGS_MAX)
         self._never = bytearray([255] * DOFS_MAX)
 
@@ -343,15 +351,18 @@ class Foresight:
         )
         _evaluate(
             playing, found, frames, sketching, o.cycle_course, o.fraction_course_q24, o.weight_course_q28,
-            t.first_mapping, t.mapping_count, t.mapped_dof, t.signal, t.function, t.argument, t.low_q15, t.high_q15,
-            self._shift, self._sine, puppet.gradients, o.live_course_q28, t.curve_start, t.curve_samples,
+            t.first_mapping, t.mapping_count, t.mapped_dof, t.signal, t.function, t.argument, t.same, t.low_q15,
+            t.high_q15, self._shift, self._sine, puppet.gradients, o.live_course_q28, t.curve_start, t.curve_samples,
             t.curve_mean_q15, t.samples_q15, o.pace_q22, self._spacing_q2, self._fade_q15, self._row_q15, numerator,
             denominator,
         )
         if t.programs:
             for b in range(frames):
                 o.at_frame(b, t.lives)
-                puppet.programs.evaluate(t, o, self._sine, puppet.gradients, o.live_w_q28, self._value_q15)
+                puppet.programs.sketch(
+                    t, o, self._sine, puppet.gradients, o.live_w_q28, self._value_q15,
+                    self._spacing_q2[b] if sketching else 0, o.pace_q22, self._fade_q15,
+                )
                 _add_programs(
                     playing, found, b, o.weight_course_q28, t.first_mapping, t.mapping_count, t.mapped_dof, t.signal,
                     t.function, t.same, t.low_q15, t.high_q15, self._shift, self._value_q15, numerator, denominator,

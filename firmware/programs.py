@@ -92,10 +92,17 @@ def _evaluate(
     curve_start: ptr16,
     curve_samples: ptr16,
     samples_q15: ptr16,
+    curve_mean_q15: ptr16,
+    spacing_q2: int,
+    pace_q22: ptr32,
+    fade_q15: ptr16,
     stack: ptr32,
     value_q15: ptr16,
 ):
     """Write the values of all programs of the playing actions.
+
+    If `spacing` is not 0 the frame is one of a sketch (see `foresight`), and what is periodic counts for the less, the farther it gets on
+    its way to the next one: `pace[n]` is the part of a cycle by which a frame moves action `n` of the list on.
 
     Values are Q16 and saturate at -16..16; on the stack they stand with 2^21 added. A phase `a * t + b` is `a_q4` times
     the fraction in Q22, within 2^30, in sixteenths of whole cycles. Bits: a product has limbs of 11 + 10
@@ -123,6 +130,7 @@ def _evaluate(
                             at += 1
                         a = pool[at] - 256
                         at += 1
+                        mean = k
                         whole = a * int(cycle[i])
                         u = ((whole & 15) << 22) + a * ((fraction_q24[i] + 2) >> 2)
                         whole = whole >> 4
@@ -154,12 +162,22 @@ def _evaluate(
                             if y == x:
                                 y = 0
                             v = (w << 1) + (((int(samples_q15[k + y]) - w) * u + 0x2000) >> 14)
+                            mean = int(curve_mean_q15[mean]) << 1
                         else:
                             if code == _RCOS:
                                 u = (u + 0x1000000) & 0x3FFFFFF
                             x = u >> 17
                             w = int(sine[x])
                             v = (w << 1) + (((int(sine[x + 1]) - w) * ((u >> 2) & 0x7FFF) + 0x2000) >> 14)
+                        if spacing_q2:
+                            if code != _CURVE:
+                                mean = 32768
+                            x = ((a * pace_q22[n]) >> 4) & 0x3FFFFF
+                            if x > 0x200000:
+                                x = 0x400000 - x
+                            x = (x * spacing_q2) >> 18
+                            y = int(fade_q15[x]) if x < 64 else 0
+                            v = mean + ((((v - mean) >> 1) * y) >> 14)
                     elif code == _CONST:
                         v = pool[at] - _LIMIT
                         at += 1
@@ -238,11 +256,15 @@ class Programs:
 
     def evaluate(self, tables, actions, sine, gradients, live_q28, value_q15):
         """Write the values of all programs of the playing actions to `value_q15`."""
+        self.sketch(tables, actions, sine, gradients, live_q28, value_q15, 0, self._stack, sine)
+
+    def sketch(self, tables, actions, sine, gradients, live_q28, value_q15, spacing_q2, pace_q22, fade_q15):
+        """Write their values in a frame of a sketch, which stands for `spacing` frames (Q2)."""
         # fmt: off
         _evaluate(
             actions.playing, actions.found, actions.cycle, actions.fraction_q24, tables.first_mapping,
             tables.mapping_count, tables.function, tables.argument, tables.same, tables.program_start,
             tables.program_words, tables.pool, sine, gradients, live_q28, tables.curve_start, tables.curve_samples,
-            tables.samples_q15, self._stack, value_q15,
+            tables.samples_q15, tables.curve_mean_q15, spacing_q2, pace_q22, fade_q15, self._stack, value_q15,
         )
         # fmt: on
