@@ -54,7 +54,7 @@ def _text(cue: Cue, puppet: Puppet) -> str:
     gains = puppet.moods[cue.mood].gains if cue.mood is not None and cue.gains is None else None
     if gains is None or gains == NEUTRAL_GAINS:
         return cue.summary()
-    return f"{cue.summary()} (gains {' '.join(f'{gain:g}' for gain in gains)})"
+    return f"{cue.summary()}, gains {' '.join(f'{gain:g}' for gain in gains)}"
 
 
 def _wrapped(text: str, room: float, width: Measure) -> list[str]:

@@ -120,7 +120,7 @@ def test_figure_marks_the_cues_within_it_and_lists_them():
     written = [text.get_text() for text in figure.texts]
     assert all(written.count(str(number)) == 2 for number in range(1, 10)), "above the time and in the list"
     assert "0 s  CALM, NOD 2" in written
-    assert "4 s  mood NERVOUS (gains 2.5 2 1.4 1 1 1 1)" in written
+    assert "4 s  mood NERVOUS, gains 2.5 2 1.4 1 1 1 1" in written
     assert not any("TOO_LATE" in text for text in written)
 
 
