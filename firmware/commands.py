@@ -45,6 +45,7 @@ _LEAN = (
 _LARGE = const(0x3FFFFFFF)  # more than any field may have, and no large integer
 
 _HELLO_FORMAT = messages.struct_format(messages.find(messages.HELLO)[2])
+_DICTIONARY = codec.crc32(messages.canonical_text().encode())  # here, while the heap has room for the text
 _MAPPING_FORMAT = messages.struct_format(messages.find(messages.MAPPINGS)[3])
 
 
@@ -71,7 +72,7 @@ class Commands:
 
     def __init__(self, puppet, telemetry, store):
         self.detail = 0
-        self.dictionary = codec.crc32(messages.canonical_text().encode())
+        self.dictionary = _DICTIONARY
         self._puppet = puppet
         self._telemetry = telemetry
         self.store = store

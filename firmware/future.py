@@ -12,6 +12,8 @@ corrected by until the front has come by.
 Source: SPEC of motion signal processing. It wants the whole future at once; the difference is what the bound of 1/50 is for.
 """
 
+import gc
+
 import micropython
 from micropython import const
 
@@ -97,18 +99,19 @@ class Future:
     """
 
     def __init__(self, sine):
+        self._taps = bands.tap_table()
+        self._changes_q15 = bands.change_table(KNOTS, 0)
+        self._changes_late_q15 = bands.change_table(KNOTS, 1)
+        gc.collect()  # what that took would leave holes behind
+        self._base_q15 = halves(DOFS_MAX * bands.RING)
+        self._third_q15 = halves(DOFS_MAX * bands.RING)
         self.pending = False
         self.changed = False
         self.level_q16 = words(bands.LEVELS * DOFS_MAX)
         self.foreseen_q16 = words(bands.LEVELS * DOFS_MAX)
         self._outlook = Outlook(KNOTS)
         self._foresight = Foresight(sine, KNOTS)
-        self._base_q15 = halves(DOFS_MAX * bands.RING)
-        self._third_q15 = halves(DOFS_MAX * bands.RING)
         self._row = bytearray(range(DOFS_MAX))
-        self._taps = bands.tap_table()
-        self._changes_q15 = bands.change_table(KNOTS, 0)
-        self._changes_late_q15 = bands.change_table(KNOTS, 1)
         self._before_q15 = halves(DOFS_MAX * BLOCK)
         self._delta_q15 = words(DOFS_MAX * BLOCK)
         self._column_q15 = halves(DOFS_MAX)

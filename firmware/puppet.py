@@ -46,6 +46,8 @@ class Puppet:
     """
 
     def __init__(self, board):
+        self._sine = functions.sine_table()
+        self.future = Future(self._sine)  # first, while the heap has room for its rings
         self.frame = -1
         self.frame_max_us = 0
         self.clipped = 0
@@ -54,6 +56,7 @@ class Puppet:
         self.drivers = Drivers(board)
         self.tables = Tables(self.drivers)  # those that play
         self.staged = Tables(self.drivers)  # those that the host fills
+        gc.collect()
         self.motor = Motor(board, self.drivers, self.tables)
         self.tempo_q16 = words(1)
         self.actions = Actions()
@@ -66,12 +69,10 @@ class Puppet:
         self.base_ring_q15 = self.base_ring.value_q15
         self.signal_ring_q15 = self.motor.trajectory.ring.value_q15
         self._board = board
-        self._sine = functions.sine_table()
         self.gradients = halves(NOISE_TABLES * GRADIENTS)
         self.master = words(clock.PHASE_WORDS)
         self.blinks = Blinks()
         self.programs = Programs()
-        self.future = Future(self._sine)
         self._live_x_q28 = words(LIVES_MAX)
         self._live_w_q28 = words(LIVES_MAX)
         self._hold_target_q28 = words(DOFS_MAX)

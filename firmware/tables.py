@@ -6,6 +6,8 @@ that a kernel will use is checked here, because viper checks nothing. All arrays
 
 from array import array
 
+import micropython
+
 from firmware.programs import check as check_program
 from shared import program as isa
 from shared.formats import (
@@ -73,14 +75,39 @@ _UNIT_TO_POSITION = POSITION_BITS - VALUE_BITS
 _RESPONSES = 6  # coefficients of a character
 
 
+@micropython.viper
+def _clear_words(values: ptr32, count: int):
+    """Set words to 0."""
+    i = 0
+    while i < count:
+        values[i] = 0
+        i += 1
+
+
+@micropython.viper
+def _clear_halves(values: ptr16, count: int):
+    """Set 16-bit words to 0."""
+    i = 0
+    while i < count:
+        values[i] = 0
+        i += 1
+
+
 def words(count):
-    """Return an array of `count` signed 32-bit words, all 0."""
-    return array("i", bytes(4 * count))
+    """Return an array of `count` signed 32-bit words, all 0.
+
+    It is made from a range, not from bytes: those would be as large as it is, and leave a hole in the heap.
+    """
+    values = array("i", range(count))
+    _clear_words(values, count)
+    return values
 
 
 def halves(count):
     """Return an array of `count` unsigned 16-bit words, all 0."""
-    return array("H", bytes(2 * count))
+    values = array("H", range(count))
+    _clear_halves(values, count)
+    return values
 
 
 def is_pin(pin):
