@@ -12,20 +12,20 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marotte.bands import centres_hz, hertz
+from marotte.cue_list import Listed, NumberedCue, in_columns, numbered
 from marotte.errors import MarotteError
-from marotte.puppet import NEUTRAL_GAINS, Puppet
+from marotte.spectrum import spectrum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from marotte.rendering import Rendering
-    from marotte.score import Cue, Score
+    from marotte.score import Score
 
 SUFFIXES = (".png", ".svg")
 DOFS = 4
@@ -54,13 +54,18 @@ TITLE = 0.3
 AXIS = 0.55
 WEIGHT_ROW = 0.23
 LINE = 0.175
+LIST_INDENT = 0.35
+LIST_WIDTH = 3.55
 CUES_MOST = 60
-"""More cues than that are only counted."""
+"""More cues than that are only counted, and their lines are thinner."""
+LEVELS_MOST = 4
+"""Rows of cues' numbers above the time; a number that would need one more is in the list only."""
+COLUMNS = 3
+"""Of a list of cues that is too long to stand beside the weights."""
 NAME_MOST = 24
 SPECTRUM_DECADES = 3.5
-BINS_PER_OCTAVE = 6
 SPAN_LEAST = 0.02
-AMPLITUDE_LEAST = 0.001
+AMPLITUDE_LEAST = 0.03
 AMPLITUDE_NONE = 1e-9
 """What the axes of a DOF that hardly moves show at least; a logarithmic axis has no 0."""
 
@@ -86,7 +91,7 @@ def plot(rendering: Rendering, score: Score | None = None, dofs: Sequence[str] |
     for name in names:
         if name not in rendering.base:
             raise KeyError(name)
-    return _Drawing(rendering, _numbered(score, rendering), names).figure
+    return _Drawing(rendering, numbered(score, rendering.puppet, len(rendering.frames)), names).figure
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
@@ -113,77 +118,33 @@ def moving(rendering: Rendering) -> list[str]:
     return [name for name in spans if name in most]
 
 
-def spectrum(values: Sequence[float], rate_hz: float) -> tuple[list[float], list[float]]:
-    """Return frequencies in Hz and the amplitudes there, those of a sixth of an octave each put together.
-
-    The mean is taken away and a Hann window applied. The sum of the squares is that of the motion. A sine of amplitude `a` gives
-    `a` at its frequency, or somewhat less where a sixth of an octave is narrower than the window's three lines.
-    """
-    import numpy as np
-
-    count = len(values)
-    window = np.hanning(count + 1)[:-1]
-    total = window.sum()
-    if total == 0:
-        return [], []
-    lines = np.abs(np.fft.rfft((np.asarray(values) - np.mean(values)) * window))[1:] * 2 / total
-    lines /= (
-        math.sqrt(count * np.square(window).sum()) / total
-    )  # a line of the motion is seen in several of the spectrum
-    frequencies = np.fft.rfftfreq(count, 1 / rate_hz)[1:]
-    bins = np.round(np.log2(frequencies * count / rate_hz) * BINS_PER_OCTAVE)
-    centres = [float(np.exp(np.log(frequencies[bins == each]).mean())) for each in np.unique(bins)]
-    amplitudes = [float(np.sqrt(np.square(lines[bins == each]).sum())) for each in np.unique(bins)]
-    return centres, amplitudes
-
-
-@dataclass(frozen=True)
-class _Numbered:
-    """A cue as the figure has it."""
-
-    number: int
-    at_s: float
-    text: str
-
-
-def _numbered(score: Score | None, rendering: Rendering) -> list[_Numbered]:
-    """Return the cues within a rendering, in order."""
-    cues = sorted(score.cues, key=lambda cue: cue.at_s) if score else []
-    within = [cue for cue in cues if cue.frame(rendering.puppet.frame_rate_hz) < len(rendering.frames)]
-    return [_Numbered(n + 1, float(cue.at_s), _cue_text(cue, rendering.puppet)) for n, cue in enumerate(within)]
-
-
-def _cue_text(cue: Cue, puppet: Puppet) -> str:
-    """Return what a cue does, and what its mood makes of the gains."""
-    gains = puppet.moods[cue.mood].gains if cue.mood is not None and cue.gains is None else None
-    if gains is None or gains == NEUTRAL_GAINS:
-        return cue.summary()
-    return f"{cue.summary()} (gains {' '.join(f'{gain:g}' for gain in gains)})"
-
-
 class _Drawing:
     """A figure in the making, from its top downwards."""
 
-    def __init__(self, rendering: Rendering, cues: list[_Numbered], dofs: list[str]) -> None:
+    def __init__(self, rendering: Rendering, cues: list[NumberedCue], dofs: list[str]) -> None:
         from matplotlib.figure import Figure
 
         self.rendering = rendering
         self.rate_hz = rendering.puppet.frame_rate_hz
         self.end_s = len(rendering.frames) / self.rate_hz
         self.cues = cues
+        self.cue_width = 0.8 if len(cues) <= CUES_MOST else 0.3
         weights = {name: values for name, values in rendering.weights.items() if any(values)}
         self.left = max([0.75, *(MARGIN + 0.12 + text_width(_short(name)) for name in weights)])
         self.time_width = TIME_WIDTH - (self.left - 0.75)
         self.right = self.left + self.time_width + GAP
         self.spectrum_width = WIDTH - MARGIN - self.right
         levels = self.cue_levels()
-        strip = STRIP_ROW * (max(levels, default=0) + 1)
-        lines = self.cue_lines()
+        strip = STRIP_ROW * (max((level for level in levels if level is not None), default=0) + 1)
+        listed = self.cue_lines()
         weights_height = TITLE + WEIGHT_ROW * len(weights) if weights else 0.0
-        list_height = TITLE + LINE * len(lines) if lines else 0.0
-        rows = len(dofs) * (ROW + TITLE)
-        below = max(weights_height, list_height)
-        self.height = MARGIN + HEADER + strip + rows + below + AXIS + MARGIN
+        rows = MARGIN + HEADER + strip + len(dofs) * (ROW + TITLE)
+        lines = sum(map(len, listed))
+        is_beside = AXIS + TITLE + LINE * lines <= weights_height + AXIS
+        columns = [listed] if is_beside else in_columns(listed, COLUMNS)
+        list_height = TITLE + LINE * max(sum(map(len, column)) for column in columns) if listed else 0.0
+        list_top = rows + AXIS if is_beside else rows + weights_height + AXIS
+        self.height = max(rows + weights_height + AXIS, list_top + list_height) + MARGIN
         self.figure = Figure(figsize=(WIDTH, self.height))
         self.header()
         top = MARGIN + HEADER
@@ -196,7 +157,9 @@ class _Drawing:
             top += ROW + TITLE
         if weights:
             self.weights(weights, top + TITLE)
-        self.cue_list(lines, top + AXIS + 0.1)
+        for place, column in enumerate(columns):
+            left = self.right - GAP + 0.3 if is_beside else MARGIN + place * (WIDTH - 2 * MARGIN) / COLUMNS
+            self.cue_list(column, left, list_top + 0.1, has_title=place == 0)
 
     def axes(self, left: float, top: float, width: float, height: float) -> Axes:
         """Return axes at a place, in inches from the left and from the top."""
@@ -238,21 +201,24 @@ class _Drawing:
             labelcolor=INK,
         )
 
-    def cue_levels(self) -> list[int]:
-        """Return for each cue the row in which its number stands, so that no two touch."""
+    def cue_levels(self) -> list[int | None]:
+        """Return for each cue the row in which its number stands, so that no two touch; None where there is no room."""
         ends: list[float] = []
-        levels = []
+        levels: list[int | None] = []
         for cue in self.cues if len(self.cues) <= CUES_MOST else ():
             at = cue.at_s / self.end_s * self.time_width
             half = text_width(str(cue.number)) / 2 + 0.03
             level = next((level for level, end in enumerate(ends) if at - half >= end), len(ends))
-            ends[level : level + 1] = [at + half]
-            levels.append(level)
+            if level < LEVELS_MOST:
+                ends[level : level + 1] = [at + half]
+            levels.append(level if level < LEVELS_MOST else None)
         return levels
 
-    def strip(self, top: float, height: float, levels: list[int]) -> None:
+    def strip(self, top: float, height: float, levels: list[int | None]) -> None:
         """Write the numbers of the cues above the time."""
         for cue, level in zip(self.cues, levels, strict=False):
+            if level is None:
+                continue
             left = self.left + cue.at_s / self.end_s * self.time_width
             self.text(left, top + height - STRIP_ROW * (level + 1), str(cue.number), SMALL_PT, ha="center")
 
@@ -264,7 +230,7 @@ class _Drawing:
         if has_time:
             axes.set_xlabel("time (s)", fontsize=SMALL_PT, color=INK)
         for cue in self.cues:
-            axes.axvline(cue.at_s, color=CUE, linewidth=0.8, zorder=0)
+            axes.axvline(cue.at_s, color=CUE, linewidth=self.cue_width, zorder=0)
         return axes
 
     def dof(self, name: str, top: float, is_first: bool, has_time: bool) -> None:
@@ -273,7 +239,9 @@ class _Drawing:
         axes = self.time_axes(top, ROW, has_time)
         if is_first:  # the lines of the cues go up to their numbers
             for cue in self.cues:
-                axes.axvline(cue.at_s, 1, 1 + (TITLE - 0.02) / ROW, color=CUE, linewidth=0.8, zorder=0, clip_on=False)
+                axes.axvline(
+                    cue.at_s, 1, 1 + (TITLE - 0.02) / ROW, color=CUE, linewidth=self.cue_width, zorder=0, clip_on=False
+                )
         title = axes.set_title(_short(name), loc="left", fontsize=MEDIUM_PT, fontweight="bold", color=INK, pad=4)
         title.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 1})
         taps = {"base": rendering.base[name], "signal": rendering.signal[name], "motor": rendering.motor[name]}
@@ -336,26 +304,20 @@ class _Drawing:
         axes.set_yticks(places, [_short(name) for name in weights])
         axes.tick_params(axis="y", length=0)
 
-    def cue_lines(self) -> list[tuple[str, str]]:
-        """Return the lines of the list of cues: what stands before a line, and the line."""
+    def cue_lines(self) -> Listed:
+        """Return the list of cues."""
         if len(self.cues) > CUES_MOST:
-            return [("", f"{len(self.cues)} cues")]
-        room = self.spectrum_width + GAP - 0.3 - _CUE_INDENT
-        lines = []
-        for cue in self.cues:
-            first, *more = _wrapped(cue.text, room)
-            lines += [(f"{cue.number}", f"{cue.at_s:.4g} s  {first}"), *(("", "    " + line) for line in more)]
-        return lines
+            return [[("", f"{len(self.cues)}, too many to be listed")]]
+        return [cue.lines(LIST_WIDTH, text_width) for cue in self.cues]
 
-    def cue_list(self, lines: list[tuple[str, str]], top: float) -> None:
-        """Write the list of cues at the right of the weights."""
-        if lines:
-            left = self.right - GAP + 0.3
+    def cue_list(self, cues: Listed, left: float, top: float, has_title: bool) -> None:
+        """Write the list of cues, or a column of it."""
+        if cues and has_title:
             self.text(left, top, "cues", MEDIUM_PT)
-            for place, (number, line) in enumerate(lines):
-                line_top = top + TITLE + LINE * place
-                self.text(left + _CUE_INDENT - 0.12, line_top, number, SMALL_PT, ha="right")
-                self.text(left + _CUE_INDENT, line_top, line, SMALL_PT)
+        for place, (number, line) in enumerate(line for cue in cues for line in cue):
+            line_top = top + TITLE + LINE * place
+            self.text(left + LIST_INDENT - 0.12, line_top, number, SMALL_PT, ha="right")
+            self.text(left + LIST_INDENT, line_top, line, SMALL_PT)
 
 
 _LINES: dict[str, dict[str, Any]] = {
@@ -363,7 +325,6 @@ _LINES: dict[str, dict[str, Any]] = {
     "signal": {"color": SIGNAL, "linewidth": 1.5},
     "motor": {"color": MOTOR, "linewidth": 1.0},
 }
-_CUE_INDENT = 0.35
 
 
 def text_width(text: str, size_pt: float = SMALL_PT) -> float:
@@ -371,20 +332,6 @@ def text_width(text: str, size_pt: float = SMALL_PT) -> float:
     from matplotlib.textpath import TextPath
 
     return TextPath((0, 0), text, size=size_pt).get_extents().width / 72 if text.strip() else 0.0
-
-
-def _wrapped(text: str, room: float) -> list[str]:
-    """Return a text in lines that are no wider than there is room, in inches, broken at its commas."""
-    room -= text_width("00.00 s  ")
-    lines: list[str] = []
-    for part in text.split(", "):
-        while text_width(part) > room:
-            part = part[:-2] + "…"
-        if lines and text_width(f"{lines[-1]}, {part},") <= room:
-            lines[-1] += ", " + part
-        else:
-            lines[-1:] = [lines[-1] + ",", part] if lines else [part]
-    return lines
 
 
 def _short(name: str) -> str:

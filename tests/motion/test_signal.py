@@ -5,7 +5,9 @@ draws in which the reference stands at the edge of a decision, or no DOF has sig
 """
 
 import random
+import tomllib
 from fractions import Fraction
+from pathlib import Path
 
 import numpy
 import pytest
@@ -21,6 +23,8 @@ from tests.reference_signal import BANDS, WINDOW, render_signal
 
 QUICK_SEEDS, SOAK_SEEDS = range(12), range(1000, 2000)
 SECONDS = 6
+PET_SECONDS = 21
+PUPPETS = Path(__file__).parents[2] / "puppets"
 REST_FRAMES = WINDOW + 46
 DRAWS = 40
 BOUNDS = {"rest": "rest", "moving": "1/50", "wide": "1/15", "flat": "one unit", "step": "a step at news"}
@@ -85,6 +89,13 @@ def assert_within_bounds(name, errors):
 def test_signal_of_random_puppets_keeps_the_bounds(seed):
     case, expected = decided_case(seed)
     assert_within_bounds(case.name, errors_of(case, expected))
+
+
+def test_signal_of_the_pet_keeps_the_bounds():
+    puppet, score = (tomllib.loads((PUPPETS / name).read_text()) for name in ("pet.toml", "pet-score.toml"))
+    expected = render_signal(puppet, score, PET_SECONDS * puppet["frame_rate"])
+    assert (expected.gains != 1).any(axis=1).mean() > 0.3, "its moods are to be seen"
+    assert_within_bounds("pet", errors_of(Case("pet", puppet, score), expected))
 
 
 @pytest.mark.parametrize("corner", QUICK_CORNERS, ids=lambda corner: corner.name)

@@ -12,10 +12,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from marotte import plotting
 from marotte.errors import MarotteError
-from marotte.plotting import PlotError, moving, plot, save_figure, spectrum
+from marotte.plotting import PlotError, moving, plot, save_figure
 from marotte.puppet import Dof, Mood, Puppet
 from marotte.rendering import Rendering
 from marotte.score import Cue, Score
+from marotte.spectrum import spectrum
 
 LONG = "AN_ACTION_WITH_AN_EXTREMELY_LONG_NAME"
 NAMES = ("SWAY", "A_DOF", "WHEEL", "STILL", "SLOW", "LAST")
@@ -119,8 +120,19 @@ def test_figure_marks_the_cues_within_it_and_lists_them():
     written = [text.get_text() for text in figure.texts]
     assert all(written.count(str(number)) == 2 for number in range(1, 10)), "above the time and in the list"
     assert "0 s  CALM, NOD 2" in written
-    assert "4 s  mood NERVOUS (gains 2.5 2 1.4 1 1 1 1)" in written
+    assert "4 s  mood NERVOUS, gains 2.5 2 1.4 1 1 1 1" in written
     assert not any("TOO_LATE" in text for text in written)
+
+
+@pytest.mark.parametrize(("actions", "is_beside"), [(2, False), (20, True)])
+def test_figure_lists_the_cues_beside_the_weights_or_in_columns_below_them(actions, is_beside):
+    rendering = rendering_of(weights=[f"A{number}" for number in range(actions)])
+    figure = plot(rendering, Score(SCORE.cues[:4]), ["SWAY"])
+    box = axes_titled(figure, "weights (a full row is 2.49)").get_position()
+    (line,) = (text for text in figure.texts if text.get_text() == "0 s  CALM, NOD 2")
+    left, top = line.get_position()
+    assert (left > box.x1 and top > box.y0) == is_beside
+    assert (top < box.y0) == (not is_beside)
 
 
 def test_figure_has_spectra_with_the_bands_marked():
