@@ -36,12 +36,25 @@ _FAR = const(271)
 _BEND_DOFS = const(6)  # that one portion bends
 
 # What work costs on an RP2040 at 125 MHz, in microseconds, a little more than was measured (`make bench`).
-_FRAME_US = const(50)
-_FRAME_DOF_US = const(9)
-_FRAME_ACTION_US = const(8)
-_FRAME_MAPPING_US = const(2)
-_FRAME_WORD_US = const(3)
-_REST_US = const(5000)  # the sketches, the bands
+_PERIOD_PERCENT = const(88)  # of a period; the rest is for motor ticks and the link
+_FIXED_US = const(2300)  # the frame under way, its bands
+_FIXED_DOF_US = const(60)
+_FIXED_ACTION_US = const(10)
+_FIXED_MAPPING_US = const(9)
+_NEWS_US = const(900)  # to begin anew
+_NEWS_DOF_US = const(230)
+_SKETCH_US = const(1000)  # one sketch
+_SKETCH_DOF_US = const(20)
+_SKETCH_ACTION_US = const(60)
+_SKETCH_MAPPING_US = const(25)
+_SKETCH_WORD_US = const(42)
+_FRAME_US = const(10)  # one frame to come
+_FRAME_DOF_NS = const(10300)
+_FRAME_ACTION_NS = const(7500)
+_FRAME_MAPPING_NS = const(1500)
+_FRAME_WORD_NS = const(2600)
+_FRAME_LIVE_NS = const(4500)
+_SKETCHES = const(4)  # sketches that must fit into a period to be made at all, as two of them are
 _START_US = const(160000)  # for the future of frame 0
 
 _BEGIN = const(0)  # stages of work
@@ -158,6 +171,8 @@ class Future:
         self._has_changed = False
         self._is_exchanged = False
         self._is_sketched = False
+        self._is_sketchy = True  # whether there is time for sketches
+        self._fixed_us = self._sketch_us = self._frame_us = 1
 
     # --- in a frame
 
@@ -173,9 +188,13 @@ class Future:
         self._is_exchanged = False
 
     def _sketch_before(self, tables, puppet):
-        puppet.actions.compute_phases(tables, puppet.master, tables.frame_rate_hz)  # which lists who plays
-        self._sketch(tables, puppet, False)
-        _copy_halves(self._foresight.future_q15, self._before_q15, tables.dofs * BLOCK)
+        a = puppet.actions
+        a.compute_phases(tables, puppet.master, tables.frame_rate_hz)  # which lists who plays
+        self._weigh(tables, a.playing, a.found)
+        self._is_sketchy = _SKETCHES * self._sketch_us * tables.frame_rate_hz < 1000000
+        if self._is_sketchy:
+            self._sketch(tables, puppet, False)
+            _copy_halves(self._foresight.future_q15, self._before_q15, tables.dofs * BLOCK)
         self._is_sketched = True
 
     def _sketch(self, tables, puppet, is_behind):
@@ -186,7 +205,7 @@ class Future:
         """Note, in frame 0, that something has arrived that was not there for `start`: what that has foreseen counts as before."""
         for b in range(BLOCK):
             self._recall(tables, b)
-        self._is_sketched = True
+        self._is_sketched = self._is_sketchy = True
 
     def _recall(self, tables, knot):
         """Take what was to be expected at a knot from the ring."""
@@ -245,14 +264,17 @@ class Future:
         self._stage = _COMPUTE
         until = self._filled
         if self._has_news:
-            self._sketch(tables, puppet, True)
-            self._differ(tables, self._base_column_q15)
-            self._bent_until = until
-            self._dof = 0
-            self._stage = _BEND
+            if self._is_sketchy:
+                self._sketch(tables, puppet, True)
+                self._differ(tables, self._base_column_q15)
+                self._bent_until = until
+                self._dof = 0
+                self._stage = _BEND
+            else:
+                bands.put_column(self._base_q15, self._row, tables.dofs, self._frame - 1, self._base_column_q15)
         if until < self._frame + _AHEAD - 1:
             frames = self._frame + _FAR - until
-            if self._has_news:  # the last knot of the sketch is as far away
+            if self._stage == _BEND:  # the last knot of the sketch is as far away
                 self._fill(tables, until, frames, self._foresight.future_q15, BLOCK, BLOCK - 1)
             else:
                 bands.column(self._base_q15, self._row, tables.dofs, until - 1, self._column_q15)
@@ -263,7 +285,11 @@ class Future:
             self._outlook.take(self._frame, tables, puppet)
             self._front = self._frame
             self._has_changed = True
-        self._quota = self._portion(tables, 1000000 // tables.frame_rate_hz)
+        self._weigh(tables, self._outlook.playing, self._outlook.found)
+        us = 10000 * _PERIOD_PERCENT // tables.frame_rate_hz - self._fixed_us
+        if self._stage == _BEND:
+            us -= _NEWS_US + _NEWS_DOF_US * tables.dofs + 2 * self._sketch_us
+        self._quota = self._portion(us)
 
     def _differ(self, tables, base_q15):
         """Note what has changed at the knots; the first one is the frame that has been, whose base is known."""
@@ -285,16 +311,37 @@ class Future:
         # fmt: on
         self._dof = dofs
         if dofs == tables.dofs:
+            # Where the change begins it is not straight, and what is smoothed has to be smoothed anew.
+            first = self._frame - 1 - bands.THIRD_REACH
+            self._smooth_some(tables, first, BLOCK + 1)
+            self._smooth_some(tables, first + BLOCK + 1, bands.THIRD_REACH)
             self._stage = _COMPUTE
 
-    def _portion(self, tables, period_us):
-        """Return how many frames to come are computed within one period, 1 to 272."""
-        o = self._outlook
-        mappings = _load(o.playing, o.found, tables.mapping_count)
-        frame_us = _FRAME_US + _FRAME_DOF_US * tables.dofs + _FRAME_ACTION_US * o.found + _FRAME_MAPPING_US * mappings
-        words = _program_words(o.playing, o.found, tables.first_mapping, tables.mapping_count, tables.function, tables.argument, tables.program_words)
-        frame_us += _FRAME_WORD_US * words
-        return min(_FAR, max(1, (period_us // 2 - _REST_US) // frame_us))
+    def _smooth_some(self, tables, first, frames):
+        # fmt: off
+        self._smooth(
+            self._base_q15, self._third_q15, self._row, tables.dofs, tables.signal, first, frames, self._scratch
+        )
+        # fmt: on
+
+    def _weigh(self, tables, playing, found):
+        """Note what frames to come and sketches cost for the actions of a list, so many microseconds, whatever MCU this is."""
+        t = tables
+        # fmt: off
+        words = _program_words(
+            playing, found, t.first_mapping, t.mapping_count, t.function, t.argument, t.program_words
+        ) if t.programs else 0
+        # fmt: on
+        mappings = _load(playing, found, t.mapping_count)
+        self._fixed_us = _FIXED_US + _FIXED_DOF_US * t.dofs + _FIXED_ACTION_US * found + _FIXED_MAPPING_US * mappings
+        self._sketch_us = _SKETCH_US + _SKETCH_DOF_US * t.dofs + _SKETCH_ACTION_US * found
+        self._sketch_us += _SKETCH_MAPPING_US * mappings + _SKETCH_WORD_US * words
+        frame_ns = _FRAME_DOF_NS * t.dofs + _FRAME_ACTION_NS * found + _FRAME_MAPPING_NS * mappings
+        self._frame_us = _FRAME_US + (frame_ns + _FRAME_WORD_NS * words + _FRAME_LIVE_NS * t.lives) // 1000
+
+    def _portion(self, us):
+        """Return how many frames to come are computed in a time."""
+        return min(_FAR, max(1, us // self._frame_us))
 
     def _fill(self, tables, first, frames, value_q15, stride, at):
         # fmt: off
@@ -313,11 +360,8 @@ class Future:
         bands.put_block(
             self._base_q15, self._row, tables.dofs, tables.signal, front, frames, self._foresight.future_q15
         )
-        self._smooth(
-            self._base_q15, self._third_q15, self._row, tables.dofs, tables.signal, front - bands.THIRD_REACH - 1,
-            frames + 1, self._scratch,
-        )
         # fmt: on
+        self._smooth_some(tables, front - bands.THIRD_REACH - 1, frames + 1)
         if front < self._frame + _AHEAD - 1:
             self._has_changed = True
         self._quota -= frames
@@ -342,7 +386,8 @@ class Future:
         self._frame = 0
         self._outlook.take(1, tables, puppet)
         self._front = 1
-        self._quota = self._portion(tables, _START_US)
+        self._weigh(tables, self._outlook.playing, self._outlook.found)
+        self._quota = self._portion(_START_US)
         self._has_news = self._has_changed = self._is_exchanged = self._is_sketched = False
         self._stage = _COMPUTE
         self.pending = True
