@@ -103,7 +103,7 @@ def _apply(
 ) -> int:
     """Let all targets stamped `frame` or earlier act; return how many wait.
 
-    `counts[0]` counts the late ones, `counts[1]` the tempos of actions.
+    `counts[0]` counts the late ones, up to 2^30 - 1, `counts[1]` the tempos of actions.
     """
     kept = 0
     n = 0
@@ -111,7 +111,7 @@ def _apply(
         if queue_frame[n] <= frame:
             kind = int(queue_kind[n])
             if kind < 128:
-                if queue_frame[n] < frame:
+                if queue_frame[n] < frame and counts[0] < 0x3FFFFFFF:
                     counts[0] = counts[0] + 1
             kind = kind & 127
             if kind == WEIGHT:

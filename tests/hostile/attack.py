@@ -21,8 +21,9 @@ PUPPETS = Path(__file__).parents[2] / "puppets"
 RANGES = {"B": (0, 0xFF), "H": (0, 0xFFFF), "I": (0, 0xFFFFFFFF), "i": (-(1 << 31), (1 << 31) - 1)}
 COMMANDS = {message[0]: message for message in messages.MESSAGES if message[1] < 128}
 TABLE_PARTS = (
-    "begin robot device dof character output feedback guard action mappings live curve program blink keep commit"
-).split()
+    *("begin", "robot", "device", "dof", "character", "output", "feedback", "guard", "action", "mappings", "live"),
+    *("curve", "program", "blink", "keep", "commit"),
+)
 ANSWER_US = 600_000
 """Longest time for an answer; an RP2040 takes as long for a `commit`, at rest."""
 STEP_US = 1000
@@ -306,7 +307,7 @@ def _record(name, fields, items):
 
 
 def assault(mcu, seed, rounds=1, resets=True):
-    """Attack an MCU for so many rounds; return the attack. With `resets` it is reset when it has kept a file of the attacker's."""
+    """Attack an MCU for so many rounds; return the attack. With `resets` it is reset when it has kept a file of ours."""
     attack = Attack(mcu, seed)
     for _ in range(rounds):
         begin = attack.upload()

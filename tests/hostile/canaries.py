@@ -87,7 +87,7 @@ def perform_on_pc(width, fault):
 
     plant(fault)
     commands, records, kept, resets = sys.argv[1:5]
-    board = Board(open(commands, "rb"), open(records, "wb"), kept, int(resets))
+    board = Board(open(commands, "rb"), open(records, "wb"), kept, int(resets))  # noqa: PTH123, SIM115
     while True:
         perform(board)
         report()
