@@ -38,6 +38,9 @@ GREETING_US = 150_000
 STEP_US = 2_000
 """Longest wait for one look at the carrier while something is expected."""
 
+TAPS_KEPT = 1 << 16
+"""Frames whose taps wait to be taken; of more than that, the oldest are dropped."""
+
 DICTIONARY = codec.crc32(messages.canonical_text().encode())
 
 
@@ -74,7 +77,7 @@ class Session:
         self.carrier = carrier
         self.link = Link(carrier, self._on_message)
         self.welcome: dict[str, int] = {}
-        self.taps: deque[tuple[int, int, list[int]]] = deque()
+        self.taps: deque[tuple[int, int, list[int]]] = deque(maxlen=TAPS_KEPT)
         self.weights: tuple[int, dict[int, int]] = (-1, {})
         self._tables: Tables | None = None
         self._status: dict[str, int] = {}
