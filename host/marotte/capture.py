@@ -184,7 +184,7 @@ def _records(path: str, file: IO[str]) -> Iterator[Record]:
         if not line:
             return
         match = _RECORD.fullmatch(line.rstrip("\n"))
-        if not match:
+        if not match or len(line) == _LINE_MAX:
             raise _mistake(path, number, line, f"TIME_US {TO_MCU} HEX or TIME_US {FROM_MCU} HEX")
         at_us = int(match[1])
         if at_us < last_us:

@@ -160,6 +160,8 @@ def _columns(
     values: list[float] = []
     rows = csv.reader(lines[1:], delimiter=delimiter)
     for row in rows:
+        if len(mistakes) >= _MISTAKES_MAX:
+            break
         if not any(cell.strip() for cell in row):
             continue
         line = rows.line_num + 1
@@ -178,7 +180,7 @@ def _columns(
             times_s.append(time_s)
             values.append(numbers[header.index(column)])
     if mistakes:
-        raise FileMistakes(mistakes[:_MISTAKES_MAX])
+        raise FileMistakes(mistakes)
     if not values:
         raise _mistake(path, None, column, "has no row, expected at least two")
     if not clock:

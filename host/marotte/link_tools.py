@@ -144,7 +144,7 @@ _HISTORY = 16
 
 
 def _compare_answers(sent: list[Packet], before: list[Message], now: list[Message], result: Replay) -> None:
-    names = {packet.seq: packet.message.name for packet in sent if packet.message}
+    names = {packet.seq: packet.message.name for packet in sent if packet.message}  # the last of each number
     recorded, heard = _answers(before), _answers(now)
     for place in range(max(len(recorded), len(heard))):
         old = recorded[place] if place < len(recorded) else None
@@ -152,19 +152,18 @@ def _compare_answers(sent: list[Packet], before: list[Message], now: list[Messag
         if old == new:
             result.answers += 1
             continue
-        seq = (old or new or (0, 0, 0))[0]
-        what = f"answer {place + 1} (command {seq}, the last of that number being {names.get(seq, 'unknown')})"
-        result.differences.append(f"{what}: {_answer_text(new)}, in the capture {_answer_text(old)}")
+        told = f"{_answer_text(new, names)}, in the capture {_answer_text(old, names)}"
+        result.differences.append(f"answer {place + 1}: {told}")
         if old is None or new is None or old[0] != new[0]:
             result.differences.append("what follows cannot be compared")
             return
 
 
-def _answer_text(answer: tuple[int, int, int] | None) -> str:
+def _answer_text(answer: tuple[int, int, int] | None, names: dict[int, str]) -> str:
     if answer is None:
         return "none"
-    _, status, detail = answer
-    return f"status {status}, detail {detail}"
+    seq, status, detail = answer
+    return f"command {seq} ({names.get(seq, 'unknown')}) has status {status}, detail {detail}"
 
 
 def _compare_frames(before: list[Message], now: list[Message], result: Replay) -> None:

@@ -218,75 +218,87 @@ def test_places_of_any_text_are_found_or_not(text):
 
 # --- files that are large or deep
 
-FULL = BYTES_MAX - 100
 
-
-def filled(line, head="", tail=""):
-    """Return a file of nearly the greatest size: `line` again and again, each with its number in the place of `#`."""
-    count = (FULL - len(head) - len(tail)) // (len(line) + 6)
+def filled(full, line, head="", tail=""):
+    """Return a file of nearly so many bytes: `line` again and again, each with its number in the place of `#`."""
+    count = (full - len(head) - len(tail)) // (len(line) + 5 * line.count("#"))
     return head + "".join(line.replace("#", str(number)) for number in range(count)) + tail
 
 
-HEAVY = {
-    "nothing": "",
-    "one name": "a" * FULL + " = 1",
-    "one DOF": f"[dof.{'A' * FULL}]",
-    "unknown keys": filled("K# = 1\n"),
-    "unknown keys that are like known ones": filled("frame_rat# = 1\n"),
-    "DOFs": filled("[dof.A#]\n"),
-    "DOFs with mistakes": filled("[dof.A#]\nrest = 7\n"),
-    "mappings": filled('["A#", 0, 1, "rsin"],\n', "[dof.A]\n[action.B]\nmap = [\n", "]"),
-    "mappings with different expressions": filled(
-        '["A", 0, 1, "rsin(#*t)+noise3(t/#)"],\n', "[dof.A]\n[action.B]\nmap = [\n", "]"
-    ),
-    "actions": filled('[action.A#]\nmap = [["A", 0, 1, "rsin"]]\n', "[dof.A]\n"),
-    "actions and a behaviour of all": filled('[action.A#]\nmap = [["A", 0, 1, "rsin"]]\n', "[dof.A]\n")[
-        : FULL // 2 - 60
-    ]
-    + "\n[behaviour.B]\n"
-    + filled("A# = 1\n")[: FULL // 2],
-    "a behaviour of unknown actions": filled(
-        "A# = 1\n", '[dof.A]\n[action.AA]\nmap = [["A", 0, 1, "rsin"]]\n[behaviour.B]\n'
-    ),
-    "cues": filled('[[cue]]\nat = 0.#\nbehaviour = "CALM"\n'),
-    "cues with mistakes": filled('[[cue]]\nat = "#"\nbehaviour = "CALN"\nmood = 3\nx = 1\n'),
-    "outputs": filled("[output.A#]\npin = 2\n"),
-    "chips": filled("[chip.A#]\nsda = 4\nscl = 5\noe = 6\n"),
-    "functions": filled('[function.A#]\nexpr = "rsin(t)"\n', "[dof.A]\n"),
-    "samples": filled("0.5,\n", "[dof.A]\n[function.A]\ntable = [\n", "]"),
-    "one expression": f'[dof.A]\n[action.A]\nmap = [["A", 0, 1, "{"1+" * (FULL // 2 - 60)}1"]]',
-    "one text": f'name = "{"x" * FULL}"',
-    "one text of escapes": f'name = "{chr(92) * 2 * (FULL // 2 - 20)}"',
-    "one long text": f"name = '''{'x' * FULL}'''",
-    "one number of many digits": f"noise_spread = 0.{'3' * FULL}",
-    "one integer of many digits": f"seed = {'3' * FULL}",
-    "one integer of as many digits as are read": f"seed = {'3' * 4300}",
-    "hexadecimal": f"seed = 0x{'f' * FULL}",
-    "arrays in arrays": f"name = {'[' * (FULL // 2)}{']' * (FULL // 2)}",
-    "arrays as deep as they are read": f"name = {'[' * 300}{']' * 300}\nseed = {'[' * 450}{']' * 450}",
-    "tables in tables": "name = " + "{a = " * (FULL // 6) + "1" + "}" * (FULL // 6),
-    "a dotted key": ".".join("a" * (FULL // 2)) + " = 1",
-    "dotted keys": filled(".".join("a" * 500) + ".b# = 1\n"),
-    "dotted headers": filled("[" + ".".join("a" * 500) + ".b#]\n"),
-    "brackets": "[" * FULL,
-    "quotes": '"' * FULL,
-    "triple quotes": "'''" * (FULL // 3),
-    "backslashes": 'name = "' + "\\" * FULL,
-    "points": "." * FULL,
-    "newlines": "\n" * FULL,
-    "spaces": "name = " + " " * FULL,
-    "comments": filled("# a comment with a number: #\n"),
-    "carriage returns": "\r" * FULL,
-    "a byte order mark": "\ufeffname = 'x'",
-    "null characters": "\0" * FULL,
-    "times of cues": "[[cue]]\nat = 1e-999999999\n[[cue]]\nat = 0." + "0" * 5000 + "1\n[[cue]]\nat = 1e999999999\n",
-}
+def heavy(full):
+    """Return files of about so many bytes, by what they are full of."""
+    return {
+        "nothing": "",
+        "one name": "a" * full + " = 1",
+        "one DOF": f"[dof.{'A' * full}]",
+        "unknown keys": filled(full, "K# = 1\n"),
+        "unknown keys that are like known ones": filled(full, "frame_rat# = 1\n"),
+        "DOFs": filled(full, "[dof.A#]\n"),
+        "DOFs with mistakes": filled(full, "[dof.A#]\nrest = 7\n"),
+        "mappings": filled(full, '["A#", 0, 1, "rsin"],\n', "[dof.A]\n[action.B]\nmap = [\n", "]"),
+        "mappings with different expressions": filled(
+            full, '["A", 0, 1, "rsin(#*t)+noise3(t/#)"],\n', "[dof.A]\n[action.B]\nmap = [\n", "]"
+        ),
+        "actions": filled(full, '[action.A#]\nmap = [["A", 0, 1, "rsin"]]\n', "[dof.A]\n"),
+        "actions and a behaviour of all": filled(full, '[action.A#]\nmap = [["A", 0, 1, "rsin"]]\n', "[dof.A]\n")[
+            : full // 2 - 60
+        ]
+        + "\n[behaviour.B]\n"
+        + filled(full, "A# = 1\n")[: full // 2],
+        "a behaviour of unknown actions": filled(
+            full, "A# = 1\n", '[dof.A]\n[action.AA]\nmap = [["A", 0, 1, "rsin"]]\n[behaviour.B]\n'
+        ),
+        "cues": filled(full, '[[cue]]\nat = 0.#\nbehaviour = "CALM"\n'),
+        "cues with mistakes": filled(full, '[[cue]]\nat = "#"\nbehaviour = "CALN"\nmood = 3\nx = 1\n'),
+        "outputs": filled(full, "[output.A#]\npin = 2\n"),
+        "chips": filled(full, "[chip.A#]\nsda = 4\nscl = 5\noe = 6\n"),
+        "functions": filled(full, '[function.A#]\nexpr = "rsin(t)"\n', "[dof.A]\n"),
+        "samples": filled(full, "0.5,\n", "[dof.A]\n[function.A]\ntable = [\n", "]"),
+        "one expression": f'[dof.A]\n[action.A]\nmap = [["A", 0, 1, "{"1+" * (full // 2 - 60)}1"]]',
+        "one text": f'name = "{"x" * full}"',
+        "one text of escapes": f'name = "{chr(92) * 2 * (full // 2 - 20)}"',
+        "one long text": f"name = '''{'x' * full}'''",
+        "one number of many digits": f"noise_spread = 0.{'3' * full}",
+        "one integer of many digits": f"seed = {'3' * full}",
+        "one integer of as many digits as are read": f"seed = {'3' * 4300}",
+        "hexadecimal": f"seed = 0x{'f' * full}",
+        "arrays in arrays": f"name = {'[' * (full // 2)}{']' * (full // 2)}",
+        "arrays as deep as they are read": f"name = {'[' * 300}{']' * 300}\nseed = {'[' * 450}{']' * 450}",
+        "tables in tables": "name = " + "{a = " * (full // 6) + "1" + "}" * (full // 6),
+        "a dotted key": ".".join("a" * (full // 2)) + " = 1",
+        "dotted keys": filled(full, ".".join("a" * 500) + ".b# = 1\n"),
+        "dotted headers": filled(full, "[" + ".".join("a" * 500) + ".b#]\n"),
+        "brackets": "[" * full,
+        "quotes": '"' * full,
+        "triple quotes": "'''" * (full // 3),
+        "backslashes": 'name = "' + "\\" * full,
+        "points": "." * full,
+        "newlines": "\n" * full,
+        "spaces": "name = " + " " * full,
+        "comments": filled(full, "# a comment with a number: #\n"),
+        "carriage returns": "\r" * full,
+        "a byte order mark": "\ufeffname = 'x'",
+        "null characters": "\0" * full,
+        "times of cues": "[[cue]]\nat = 1e-999999999\n[[cue]]\nat = 0." + "0" * 5000 + "1\n[[cue]]\nat = 1e999999999\n",
+    }
 
 
-@pytest.mark.parametrize("kind", HEAVY)
+KINDS = list(heavy(1000))
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_heavy_file_is_read_or_refused_in_bounded_time(tmp_path, kind):
-    path = tmp_path / "heavy.toml"
-    path.write_text(HEAVY[kind], "utf-8", newline="")
+    check_heavy(tmp_path / "heavy.toml", heavy(BYTES_MAX // 16)[kind])
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("kind", KINDS)
+def test_file_of_the_greatest_size_is_read_or_refused_in_bounded_time(tmp_path, kind):
+    check_heavy(tmp_path / "heavy.toml", heavy(BYTES_MAX - 100)[kind])
+
+
+def check_heavy(path, text):
+    path.write_text(text, "utf-8", newline="")
     assert path.stat().st_size <= BYTES_MAX
     assert any(map(bool, check_readings(path)))
 
@@ -361,23 +373,32 @@ def test_curves_of_any_bytes_are_read_or_refused(tmp_path_factory, data):
     check_curve(path, 1.0)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "a\n" + "1\n0\n" * ((CSV_BYTES_MAX - 10) // 4),
-        "a\n" + "x\n" * (CSV_BYTES_MAX // 2 - 10),
-        "a" * (CSV_BYTES_MAX - 10),
-        "a," * (CSV_BYTES_MAX // 2 - 10),
-        'a\n"' + "1" * (CSV_BYTES_MAX - 10),
-        '"' * (CSV_BYTES_MAX - 10),
-        "a\n" + "1" * 200_000,
-        "a\n" + "1\n" * CSV_BYTES_MAX,
-    ],
-    ids=["rows", "bad rows", "one name", "names", "one cell", "quotes", "digits", "too large"],
-)
-def test_heavy_curve_is_read_or_refused_in_bounded_time(tmp_path, text):
+def heavy_curves(full):
+    """Return CSV files of about so many bytes, by what they are full of."""
+    return {
+        "rows": "a\n" + "1\n0\n" * (full // 4),
+        "bad rows": "a\n" + "x\n" * (full // 2),
+        "one name": "a" * full,
+        "names": "a," * (full // 2),
+        "one cell": 'a\n"' + "1" * full,
+        "quotes": '"' * full,
+        "digits": "a\n" + "1" * min(full, 200_000),
+        "more than is read": "a\n" + "1\n" * CSV_BYTES_MAX,
+    }
+
+
+@pytest.mark.parametrize("kind", heavy_curves(0))
+def test_heavy_curve_is_read_or_refused_in_bounded_time(tmp_path, kind):
     path = tmp_path / "heavy.csv"
-    path.write_text(text)
+    path.write_text(heavy_curves(CSV_BYTES_MAX // 16)[kind])
+    check_curve(path, 1.0)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("kind", heavy_curves(0))
+def test_curve_of_the_greatest_size_is_read_or_refused_in_bounded_time(tmp_path, kind):
+    path = tmp_path / "heavy.csv"
+    path.write_text(heavy_curves(CSV_BYTES_MAX - 10)[kind])
     check_curve(path, 1.0)
 
 
