@@ -53,7 +53,7 @@ def good_uploads():
 
 def small_upload():
     """Return tables that have one of each part."""
-    begin = {"frame_rate_hz": 30, "dofs": 2, "actions": 1, "mappings": 2, "lives": 1, "curves": 1, "programs": 1}
+    begin = {"frame_rate_hz": 30, "dofs": 2, "actions": 2, "mappings": 4, "lives": 1, "curves": 1, "programs": 1}
     begin |= {
         "blinks": 1,
         "seed": 0,
@@ -84,16 +84,21 @@ def small_upload():
         ("feedback", {"dof": 0} | feedback, []),
         ("guard", {"dof": 0, "release_ms": 300, "duty_q15": 16384, "window_s": 1}, []),
         ("action", action, []),
+        ("action", action | {"action": 1, "first_mapping": 2, "entry": 0, "cycles": 0}, []),
         (
             "mappings",
             {"first_mapping": 0},
-            [{"dof": 0, "function": 6, "argument": 0} | mapping, {"dof": 1, "function": 7, "argument": 0} | mapping],
+            [
+                {"dof": dof, "function": function, "argument": argument} | mapping
+                for dof, function, argument in ((0, 6, 0), (1, 7, 0), (0, 5, 0), (1, 2, 15))
+            ],
         ),
         ("live", {"live": 0, "rest_q28": 1 << 27, "rise_q26": 1 << 20, "fall_q26": 1 << 20}, []),
         ("curve", {"curve": 0, "samples": 2}, [{"value_q15": 0}, {"value_q15": 32768}]),
         ("program", {"program": 0, "words": len(words)}, [{"word": word} for word in words]),
         ("blink", {"blink": 0, "threshold_q16": 1 << 15, "gap_q18": 1 << 10}, []),
-        ("keep", {"kind": 0, "first": 0}, [{"old": formats.NEW}]),
+        ("keep", {"kind": 0, "first": 0}, [{"old": formats.NEW}] * 2),
+        ("keep", {"kind": 1, "first": 0}, [{"old": formats.NEW}] * 2),
         ("commit", {}, []),
     ]
 
@@ -158,6 +163,48 @@ def changed(rng, part):
     return name, fields, items
 
 
+def single_changes():
+    """Return all changes of one number in the small upload: `(part, item or None, field, number)`."""
+    found = []
+    for place, (name, fields, items) in enumerate(small_upload()):
+        _, _, field_pairs, item_pairs = COMMANDS[name]
+        rows = [(fields, field, kind, None) for field, kind in field_pairs]
+        rows += [(item, field, kind, row) for row, item in enumerate(items) for field, kind in item_pairs]
+        for values, field, kind, row in rows:
+            least, most = RANGES[kind]
+            near = values[field]
+            others = {
+                least,
+                most,
+                0,
+                1,
+                2,
+                15,
+                16,
+                64,
+                200,
+                256,
+                40_000,
+                1 << 26,
+                1 << 30,
+                near - 1,
+                near + 1,
+                2 * near,
+            }
+            for number in sorted(others - {near}):
+                if least <= number <= most:
+                    found.append((place, row, field, number))
+    return found
+
+
+def with_change(parts, place, row, field, number):
+    """Return parts with one number changed, as `single_changes` names it."""
+    name, fields, items = parts[place]
+    fields, items = dict(fields), [dict(item) for item in items]
+    (fields if row is None else items[row])[field] = number
+    return [*parts[:place], (name, fields, items), *parts[place + 1 :]]
+
+
 class Attack:
     """A hostile host at an emulated MCU that is performing.
 
@@ -171,10 +218,14 @@ class Attack:
         self.told = Counter()
         self.packets = 0
         self.played = 0
-        self._received = b""
         self._newest = -1
-        self._session = open_session(VirtualCarrier(mcu))
-        self._seq = self._session.link._seq
+        self.begin_session()
+
+    def begin_session(self):
+        """Greet the MCU as a good host does, and forget what has come."""
+        self.mcu.receive()
+        self._received = b""
+        self._seq = open_session(VirtualCarrier(self.mcu)).link._seq
 
     def upload(self, attempts=8):
         """Upload good tables in which parts are changed, until a set of them comes into force; return its `begin`, or None."""
@@ -197,6 +248,23 @@ class Attack:
             else:
                 return sent[0][1]
         return None
+
+    def change(self, place, row, field, number):
+        """Upload the small tables with one number changed; if they come into force, let them play. Return whether they have."""
+        parts = with_change(small_upload(), place, row, field, number)
+        if self.rng.random() < 0.5:  # or they are exchanged for those that play
+            self.say("stop")
+        elif self.rng.random() < 0.5:
+            kept_parts = [("keep", {"kind": kind, "first": 0}, [{"old": 0}, {"old": 1}]) for kind in (0, 1)]
+            parts = [*parts[:-1], *kept_parts, parts[-1]] if parts[place][0] != "keep" else parts
+        if any(self.say(*part) != messages.OK for part in parts):
+            return False
+        self.say("telemetry", {"taps": 15, "taps_every": 1, "weights_every": 1})
+        self.say("weight_targets", {"frame": -1}, [{"action": action, "target_q28": 4 << 28} for action in range(2)])
+        self.say("arm")
+        self.say("start")
+        self.wait(6 * FRAME_US)
+        return True
 
     def direct(self, begin):
         """Raise weights of all actions and start, mostly armed."""
@@ -249,7 +317,8 @@ class Attack:
             for _ in range(self.rng.choice((1, 1, 3))):
                 content[self.rng.randrange(len(content))] = self.rng.randrange(256)
         else:
-            parts = [part if self.rng.random() < 0.9 else changed(self.rng, part) for part in good_uploads()[2]]
+            parts = [part for part in small_upload() if part[0] != "keep"]
+            parts = [part if self.rng.random() < 0.9 else changed(self.rng, part) for part in parts]
             content = bytearray(b"".join(_record(*part) for part in [*parts, ("start", {}, [])]))
         for name in ("kill", "stop"):
             self.say(name)
@@ -320,11 +389,17 @@ def assault(mcu, seed, rounds=1, resets=True):
             attack.talk(10)
         if attack.rng.random() < 0.3 and attack.save() and resets:
             mcu.reset()
-            mcu.receive()
-            attack._received = b""
-            attack._session = open_session(VirtualCarrier(mcu))
-            attack._seq = attack._session.link._seq
+            attack.begin_session()
             attack.wait(5 * FRAME_US)
+    return attack
+
+
+def try_changes(mcu, count, seed):
+    """Attack an MCU with tables in which one number is changed, for so many changes that a seed chooses; return the attack."""
+    attack = Attack(mcu, seed)
+    changes = single_changes()
+    for change in attack.rng.sample(changes, min(count, len(changes))):
+        attack.change(*change)
     return attack
 
 

@@ -24,7 +24,9 @@ from tests.hostile.attack import (
     assault,
     first_frames,
     good_talk,
+    single_changes,
     small_upload,
+    try_changes,
 )
 from tests.link.stage import WARM_UP_US
 from tests.motion.checked_mcu import CheckedMcu
@@ -38,6 +40,7 @@ PICO_START_US = 5_000_000
 ROUNDS = 3
 ARRAYS_MIN = 200
 """Arrays that a firmware has at least."""
+CHANGES = 300
 SOAK_SEEDS = 400
 
 PROGRAM = """
@@ -125,19 +128,19 @@ def attack_pico(image, seed, rounds):
         repl = start_guarded_pico(mcu)
         attack = assault(mcu, seed, rounds, resets=False)
         check_it_plays(mcu)
-        attack = Attack(mcu, seed)
-        kept = any(attack.save() for _ in range(5))
+        attack.begin_session()
+        assert any(attack.save() for _ in range(20))
         check_canaries(mcu)
         mcu.run_for(PICO_START_US)
         status = check_it_plays(mcu)
-        assert kept and status["store"] in (formats.STORE_PLAYED, formats.STORE_DAMAGED)
+        assert status["store"] in (formats.STORE_PLAYED, formats.STORE_DAMAGED)
         mcu.send(b"\r\x03")
         arrays, broken = report_in(repl.finish(10_000_000).encode())
         assert arrays > ARRAYS_MIN and broken == []
     return attack
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_attacked_firmware_leaves_no_array_and_no_range(seed):
     assert attack_checked(seed).packets > 100
 
@@ -157,6 +160,38 @@ def test_attacked_firmware_leaves_its_canaries_alone(tmp_path):
 @pytest.mark.parametrize("seed", range(6))
 def test_attacked_firmware_leaves_its_canaries_alone_in_32_bits(tmp_path, seed):
     assert attack_guarded(tmp_path, 32, seed).packets > 100
+
+
+def check_changes(mcu, count, seed=0, guarded=True):
+    """Play tables in which one number is changed, for so many changes of all; then the MCU plays as ever."""
+    with mcu:
+        attack = try_changes(mcu, count, seed)
+        check_it_plays(mcu)
+        if guarded:
+            check_canaries(mcu)
+    assert attack.played > count, "some of them were taken, and played for some frames"
+    return attack
+
+
+def test_changed_tables_leave_no_array_and_no_range():
+    check_changes(CheckedMcu(), CHANGES // 2, guarded=False)
+
+
+def test_changed_tables_leave_canaries_alone(tmp_path):
+    check_changes(guarded_mcu(tmp_path, 64), CHANGES)
+
+
+@pytest.mark.images
+def test_changed_tables_leave_canaries_alone_in_32_bits(tmp_path):
+    check_changes(guarded_mcu(tmp_path, 32), CHANGES, 1)
+
+
+@pytest.mark.soak
+def test_all_changed_tables_leave_everything_alone(tmp_path):
+    every = len(single_changes())
+    check_changes(CheckedMcu(), every, guarded=False)
+    for bits in (64, 32):
+        check_changes(guarded_mcu(tmp_path, bits), every)
 
 
 @pytest.mark.images
