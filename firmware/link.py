@@ -25,6 +25,7 @@ from shared import codec, messages
 from shared.formats import ACTIONS_MAX, DOFS_MAX, KILLED_BY_HOST, LIVES_MAX, MAPPINGS_MAX, QUEUE_MAX
 
 _CHUNK = const(32)  # bytes taken between two looks at the frame clock; one costs up to 50 us on USB
+_TOO_LONG = const(1000)  # more than any packet has, where the length of what never ends stays
 _STALE_US = const(20000)  # a partial packet older than this is dropped
 _HISTORY = const(16)  # answers kept for repeated commands; the host has fewer under way
 _PAYLOAD = const(2)  # place of the payload in a body
@@ -110,7 +111,9 @@ class Link:
         start = 0
         while start < end:
             stop = _collect(chunk, start, end, wire, self._length, codec.WIRE_MAX)
-            self._length = min(self._length + stop - start, codec.WIRE_MAX + 1)  # of what never ends, too
+            self._length += stop - start
+            if self._length > _TOO_LONG:
+                self._length = _TOO_LONG
             start = stop + 1
             if stop < end:
                 length = self._length
