@@ -41,7 +41,7 @@ ROUNDS = 3
 ARRAYS_MIN = 200
 """Arrays that a firmware has at least."""
 CHANGES = 300
-SOAK_SEEDS = 400
+SOAK_SEEDS = 150
 
 PROGRAM = """
 import sys
