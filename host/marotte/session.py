@@ -69,8 +69,8 @@ class Session:
     """One host and one MCU. All methods raise LinkError, or what the carrier raises, when the MCU or the port is gone.
 
     `welcome` holds the fields of the MCU's greeting. `taps` collects `(frame, taps, values_q15)` as telemetry brings
-    them: the values of all DOFs, base, signal and motor one after the other as far as `taps` names them. `weights` is
-    `(frame, {action: weight_q12})` of the last weights message.
+    them, the newest TAPS_KEPT: the values of all DOFs, base, signal and motor one after the other as far as `taps` names
+    them. `weights` is `(frame, {action: weight_q12})` of the last weights message.
     """
 
     def __init__(self, carrier: Carrier):

@@ -24,7 +24,7 @@ COUNT_MAX = (1 << 30) - 1
 
 TO_MCU, FROM_MCU = ([entry for entry in messages.MESSAGES if (entry[1] < 128) == to_mcu] for to_mcu in (True, False))
 PARTIAL_MAX = 4 * codec.WIRE_MAX
-SOAK_EXAMPLES = 20_000
+SOAK_EXAMPLES = 5_000
 
 
 class Board:

@@ -12,7 +12,7 @@ STATUSES = range(len(messages.STATUS_TEXT))
 DETAIL_MAX = 0xFFFF
 """An answer has room for no more."""
 
-SOAK_EXAMPLES = 20_000
+SOAK_EXAMPLES = 5_000
 
 
 class Switched(Mcu):

@@ -83,7 +83,7 @@ statuses = st.lists(
 )
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(welcomes, st.lists(sayings(), max_size=25), statuses, st.booleans())
 def test_run_takes_whatever_an_mcu_says(welcome, told, answers, arm):
     carrier = HostileMcu(welcome, told, answers)
