@@ -28,6 +28,8 @@ ANSWER_US = 600_000
 """Longest time for an answer; an RP2040 takes as long for a `commit`, at rest."""
 STEP_US = 1000
 FRAME_US = 33_333
+EDGES = (0, 1, 2, 15, 16, 64, 200, 256, 511, 40_000, 1 << 26, 1 << 30)
+"""Numbers that lie just inside or outside some array or range, whatever they are put in the place of."""
 
 LIMITS = sorted(
     {
@@ -173,24 +175,7 @@ def single_changes():
         for values, field, kind, row in rows:
             least, most = RANGES[kind]
             near = values[field]
-            others = {
-                least,
-                most,
-                0,
-                1,
-                2,
-                15,
-                16,
-                64,
-                200,
-                256,
-                40_000,
-                1 << 26,
-                1 << 30,
-                near - 1,
-                near + 1,
-                2 * near,
-            }
+            others = {least, most, *EDGES, near - 1, near + 1, 2 * near}
             for number in sorted(others - {near}):
                 if least <= number <= most:
                     found.append((place, row, field, number))
