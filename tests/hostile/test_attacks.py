@@ -210,7 +210,7 @@ Commands._on_weight_targets = lambda self, body, length: self._queue(cues.WEIGHT
 from firmware.tables import Tables
 original = Tables.mapping
 def mapping(self, mapping, dof, *rest):
-    bad = original(self, mapping, 0, *rest)
+    bad = original(self, mapping, dof if dof < self.dofs else 0, *rest)
     self.mapped_dof[mapping] = dof
     return bad
 Tables.mapping = mapping
