@@ -407,9 +407,10 @@ class Outlook:
         self._all = bytearray(range(BLOCK))
         self._one = bytearray([1] * BLOCK)
         self._never = bytearray([NEVER] * BLOCK)
-        self._strides = bytearray([0] + [knots[b] - knots[b - 1] for b in range(1, len(knots))])
-        self._strides_before = bytearray([1]) + self._strides[1:]
-        self._strides_behind = bytearray([0, knots[1] - 1]) + self._strides[2:]
+        strides = [knots[b] - knots[b - 1] for b in range(1, len(knots))]
+        self._strides = bytearray([0] + strides)
+        self._strides_before = bytearray([1] + strides)
+        self._strides_behind = bytearray([0, knots[1] - 1] + strides[1:])
         self._ends = bytearray(ACTIONS_MAX)
         self._target_q28 = words(ACTIONS_MAX)
         self._x_q28 = words(ACTIONS_MAX)
