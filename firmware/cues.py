@@ -181,12 +181,14 @@ class Cues:
     """The queue of stamped targets.
 
     `counts[0]` counts targets that came after their frame and acted at once, `counts[1]` tempos of actions that acted.
-    `detail` explains the last refusal: the number of the bad field, or the free places.
+    `refused` counts targets that found no place. `detail` explains the last refusal: the number of the bad field, or the free
+    places.
     """
 
     def __init__(self):
         self.count = 0
         self.detail = 0
+        self.refused = 0
         self.counts = array("i", (0, 0))
         self._frame = array("i", bytes(4 * QUEUE_MAX))
         self._kind = bytearray(QUEUE_MAX)
@@ -214,6 +216,7 @@ class Cues:
         items = (length - 4) // 5
         if self.count + items > QUEUE_MAX:
             self.detail = QUEUE_MAX - self.count
+            self.refused = (self.refused + items) & 0x3FFFFFFF
             return messages.FULL
         first = least = 0
         if kind == TEMPO:

@@ -96,7 +96,7 @@ class Puppet:
         self._rest()
         self.frame = 0
         self.frame_max_us = 0
-        self.cues.counts[0] = 0
+        self.cues.counts[0] = self.cues.refused = 0
         self.clock.start(self.motor.start(), self.tables.frame_rate_hz)
 
     def stop(self):

@@ -239,6 +239,7 @@ MESSAGES = (
             ("packets", "I"),
             ("damaged", "I"),
             ("late_targets", "I"),
+            ("refused_targets", "I"),
             ("heap_free", "I"),
         ),
         (),

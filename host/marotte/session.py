@@ -34,7 +34,7 @@ ATTACH_TIMEOUT_S = 2.0
 LOOK_US = 20_000
 """How often the MCU is asked while its outputs are being attached."""
 PING_US = 100_000
-GREETING_US = 150_000
+GREETING_US = 50_000
 STEP_US = 2_000
 """Longest wait for one look at the carrier while something is expected."""
 
