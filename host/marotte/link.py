@@ -32,7 +32,7 @@ rate of 333 Hz half as much again. With no more on the way, a `kill` that overta
 PAYLOAD_SENT_MAX = 80
 """Longest payload that is sent, so that a packet alone does not take longer than that."""
 
-RETRY_US = 50_000
+RETRY_US = 40_000
 """When a line works again the first answer comes within this and the time it takes, and the MCU counts as found within 100 ms. It
 is more than what an MCU that plays is busy with otherwise.
 """
@@ -233,9 +233,14 @@ class Link:
             self._backlog.append(command)
             self._send_what_fits()
 
-    def withdraw(self, name: str) -> None:
-        """Drop the commands of this name that have not been sent yet."""
-        self._backlog = deque(command for command in self._backlog if command.name != name)
+    def withdraw(self, name: str, is_meant: Callable[[Message], bool] = lambda message: True) -> None:
+        """Drop the commands of this name that have not been sent yet, or those of them that are meant."""
+        message_id = _BY_NAME[name][1]
+        self._backlog = deque(
+            command
+            for command in self._backlog
+            if command.name != name or not (message := unpack(message_id, command.payload)) or not is_meant(message)
+        )
 
     def pump(self, wait_us: int) -> None:
         """Let at most `wait_us` pass; take what has come, repeat what was lost. Raises LinkSilent and LinkRefused."""

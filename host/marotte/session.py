@@ -13,7 +13,7 @@ session.pump(20_000)        # often: at least every 200 ms, or the MCU finds the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 from marotte.keeping import kept
@@ -27,6 +27,7 @@ from shared import codec, formats, messages
 
 OPEN_TIMEOUT_S = 1.5
 UPLOAD_TIMEOUT_S = 5.0
+"""For the next of a puppet's tables that is acknowledged."""
 SAVE_TIMEOUT_S = 10.0
 """Erasing and writing flash keeps the MCU from answering for a while."""
 ATTACH_TIMEOUT_S = 2.0
@@ -116,11 +117,9 @@ class Session:
         refused: list[LinkRefused] = []
         for name, fields, items in parts:
             self._post(name, fields, items, partial(_note_refusal, refused, name))
-        end_us = self.carrier.now_us() + round(UPLOAD_TIMEOUT_S * 1e6)
-        while self.link.pending:
-            self._step(end_us, "the puppet's tables were not acknowledged")
+        for pending in self._flushing(UPLOAD_TIMEOUT_S, "the puppet's tables were not acknowledged"):
             if progress:
-                progress(max(0, len(parts) - self.link.pending), len(parts))
+                progress(max(0, len(parts) - pending), len(parts))
         if refused:
             raise refused[0]
         self._tables = tables
@@ -249,16 +248,19 @@ class Session:
     def weight_targets(
         self, frame: int, targets_q28: dict[int, int], on_refused: Callable[[int, int], None] | None = None
     ) -> None:
-        """Send weight targets by index of action, to act in `frame` or at once (FRAME_NOW)."""
+        """Send weight targets by index of action, to act in `frame` or at once (FRAME_NOW).
+
+        What is to act at once takes the place of older targets that were, for the same actions, if the line has not taken them yet.
+        """
         items = [{"action": action, "target_q28": target} for action, target in targets_q28.items()]
-        self._post_items("weight_targets", frame, items, on_refused)
+        self._post_items("weight_targets", frame, items, on_refused, "action")
 
     def live_targets(
         self, frame: int, targets_q28: dict[int, int], on_refused: Callable[[int, int], None] | None = None
     ) -> None:
-        """Send targets of live channels by index, to act in `frame` or at once (FRAME_NOW)."""
+        """Send targets of live channels by index, to act in `frame` or at once (FRAME_NOW), like weight targets."""
         items = [{"live": live, "target_q28": target} for live, target in targets_q28.items()]
-        self._post_items("live_targets", frame, items, on_refused)
+        self._post_items("live_targets", frame, items, on_refused, "live")
 
     def tempo(
         self, frame: int, action: int, tempo_q16: int, on_refused: Callable[[int, int], None] | None = None
@@ -302,14 +304,22 @@ class Session:
         self.link.pump(wait_us)
 
     def flush(self, timeout_s: float = 1.0) -> None:
-        """Wait until every command is acknowledged."""
-        end_us = self.carrier.now_us() + round(timeout_s * 1e6)
-        while self.link.pending:
-            self._step(end_us, "commands were not acknowledged")
+        """Wait until every command is acknowledged, `timeout_s` at most for the next one that is."""
+        for _ in self._flushing(timeout_s, "commands were not acknowledged"):
+            pass
 
     def close(self) -> None:
         """Close the port. It does not stop the puppet: `stop` and `kill` do."""
         self.carrier.close()
+
+    def _flushing(self, timeout_s: float, complaint: str) -> Iterator[int]:
+        """Let moments pass until every command is acknowledged; yield how many are not."""
+        before = end_us = 0
+        while pending := self.link.pending:
+            if pending != before:
+                before, end_us = pending, self.carrier.now_us() + round(timeout_s * 1e6)
+            self._step(end_us, complaint)
+            yield self.link.pending
 
     def _step(self, end_us: int, complaint: str) -> None:
         if self.carrier.now_us() >= end_us:
@@ -327,8 +337,20 @@ class Session:
         self.link.post(name, fields, items, on_refused)
 
     def _post_items(
-        self, name: str, frame: int, items: list[dict[str, int]], on_refused: Callable[[int, int], None] | None
+        self,
+        name: str,
+        frame: int,
+        items: list[dict[str, int]],
+        on_refused: Callable[[int, int], None] | None,
+        index: str = "",
     ) -> None:
+        if index and frame == formats.FRAME_NOW:
+            new = {item[index] for item in items}
+
+            def is_superseded(message: Message) -> bool:
+                return message.fields["frame"] == frame and new.issuperset(item[index] for item in message.items)
+
+            self.link.withdraw(name, is_superseded)
         room = items_per_message(name)
         for start in range(0, len(items), room):
             self._post(name, {"frame": frame}, items[start : start + room], on_refused)

@@ -13,7 +13,7 @@ HELD_US = 40_000
 class Direction:
     """One direction of a line. `kind` is one of FAULTS, `rate` the share of packets that it hits; `done` counts hits.
 
-    A packet is what one side sends at once. Of stalls and cuts, `rate` is the share of packets with which one begins; of "noise" it
+    A packet is what the host sends at once, or what the MCU sends up to a zero. Of stalls and cuts, `rate` is the share of packets with which one begins; of "noise" it
     is the share of bytes.
     """
 
@@ -128,6 +128,7 @@ class FaultyLine:
         self.bytes_to = self.bytes_from = 0
         self.to_mcu = Direction(to_mcu or "drop", rate if to_mcu else 0, f"{seed} to")
         self.from_mcu = Direction(from_mcu or "drop", rate if from_mcu else 0, f"{seed} from")
+        self._begun = b""  # a packet from the MCU that has no end yet
         self._coming: list[tuple[int, bytes]] = []
 
     @property
@@ -157,7 +158,9 @@ class FaultyLine:
         now_us = self.mcu.now_us
         for at_us, data in self.mcu.receive():
             self.bytes_from += len(data)
-            self._coming += self.from_mcu.carry(at_us, data)
+            *packets, self._begun = (self._begun + data).split(b"\0")
+            for packet in packets:
+                self._coming += self.from_mcu.carry(at_us, packet + b"\0")
         late = self.from_mcu.late(now_us)
         if late:
             self._coming.append((now_us, late))

@@ -215,12 +215,14 @@ class Show:
         puppet = self.tables.puppet
         for number in range(12):
             level = formats.WEIGHT_ONE - number
-            self.session.weight_targets(
-                formats.FRAME_NOW, dict.fromkeys(range(len(puppet.actions)), level), lambda *_: None
-            )
-            self.session.live_targets(
-                formats.FRAME_NOW, dict.fromkeys(range(len(puppet.lives)), level), lambda *_: None
-            )
+            for name, index, count in (
+                ("weight_targets", "action", len(puppet.actions)),
+                ("live_targets", "live", len(puppet.lives)),
+            ):
+                items = [{index: place, "target_q28": level} for place in range(count)]
+                for start in range(0, count, 15):  # each by itself: a session would leave out what a later one supersedes
+                    part = (name, {"frame": formats.FRAME_NOW}, items[start : start + 15])
+                    post(self.session, [part])
 
     def lost(self):
         """A packet that was lost, and others behind it, which the MCU refuses."""
