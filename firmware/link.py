@@ -83,6 +83,7 @@ class Link:
         self._kills = False  # whether a kill has been carried out before its turn
         self._statuses = bytearray(_HISTORY)
         self._details = [0] * _HISTORY
+        self._seals = bytearray(2 * _HISTORY)  # half of the checksum of each
         self._byte_us = board.ticks_us()
 
     def poll(self):
@@ -171,20 +172,28 @@ class Link:
             else:
                 status = self.commands.carry_out(message_id, body, length - codec.OVERHEAD)
             detail = self.commands.detail
-            self._statuses[seq % _HISTORY] = status
-            self._details[seq % _HISTORY] = detail
+            place = seq % _HISTORY
+            self._statuses[place] = status
+            self._details[place] = detail
+            self._seals[2 * place] = body[length - 4]
+            self._seals[2 * place + 1] = body[length - 3]
             self._expected = (seq + 1) & 255
             self._answer(seq, status, detail)
             if message_id == messages.HELLO:
                 self._welcome()
             elif message_id == messages.STATUS_REQUEST:
                 self.telemetry.status()
-        elif ahead >= 256 - _HISTORY:  # repeated: its answer was lost
+        elif ahead >= 256 - _HISTORY and self._is_repeated(seq, body, length):  # its answer was lost
             self._answer(seq, self._statuses[seq % _HISTORY], self._details[seq % _HISTORY])
             if message_id == messages.HELLO and seq == self._greeting:
                 self._welcome()
         else:
             self._answer(seq, messages.RESEND, self._expected)
+
+    def _is_repeated(self, seq, body, length):
+        """Return whether a command is the one that had its number, and not another host's."""
+        place = 2 * (seq % _HISTORY)
+        return body[length - 4] == self._seals[place] and body[length - 3] == self._seals[place + 1]
 
     def _is_old_greeting(self, seq):
         since_us = ticks_diff(self._board.ticks_us(), self._greeted_us)

@@ -6,11 +6,17 @@ import contextlib
 import os
 import select
 import socket
+import time
 from abc import ABC, abstractmethod
 
 from marotte.errors import MarotteError
 
 READ_BYTES = 4096
+MUTE_S = 5.0
+"""A client that has sent nothing for so long gives way to another one: it may have gone without a word, as behind a tunnel."""
+
+REFUSED_MAX = 8
+"""Clients that were refused and are kept until they have read it."""
 
 
 class Endpoint(ABC):
@@ -41,7 +47,7 @@ class Endpoint(ABC):
 
 
 class TcpEndpoint(Endpoint):
-    """A TCP port of this machine (127.0.0.1). A second client is told that the port is in use, and let go.
+    """A TCP port of this machine (127.0.0.1). A second client is told that the port is in use, and let go, unless the first is mute.
 
     Raises MarotteError if the port (0: any) is taken or not allowed.
     """
@@ -58,6 +64,8 @@ class TcpEndpoint(Endpoint):
         self._listener.setblocking(False)
         self._client: socket.socket | None = None
         self._client_name = ""
+        self._heard_s = 0.0
+        self._refused: list[socket.socket] = []
         self.url = f"socket://127.0.0.1:{self._listener.getsockname()[1]}"
 
     def waitable(self) -> list:
@@ -81,22 +89,33 @@ class TcpEndpoint(Endpoint):
             return b""
         except OSError:
             data = b""
-        if not data:
+        if data:
+            self._heard_s = time.monotonic()
+        else:
             self._drop_client()
         return data
 
     def _accept(self) -> None:
         client, address = self._listener.accept()
-        if self._client:
-            refusal = f"marotte: this emulated MCU is in use by {self._client_name}; one client at a time\r\n"
-            with contextlib.suppress(OSError):
-                client.sendall(refusal.encode())
-            client.close()
+        if self._client and time.monotonic() - self._heard_s < MUTE_S:
+            self._refuse(client)
             return
+        self._drop_client()
+        self._heard_s = time.monotonic()
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._client = client
         self._client_name = f"{address[0]}:{address[1]}"
+
+    def _refuse(self, client: socket.socket) -> None:
+        """Tell a client that the port is in use. It is closed later: what it has sent meanwhile would cut it short."""
+        refusal = f"marotte: this emulated MCU is in use by {self._client_name}; one client at a time\r\n"
+        with contextlib.suppress(OSError):
+            client.sendall(refusal.encode())
+            client.shutdown(socket.SHUT_WR)
+        self._refused.append(client)
+        if len(self._refused) > REFUSED_MAX:
+            self._refused.pop(0).close()
 
     def write(self, data: bytes) -> int:
         if not self._client:
@@ -116,6 +135,9 @@ class TcpEndpoint(Endpoint):
 
     def close(self) -> None:
         self._drop_client()
+        for client in self._refused:
+            client.close()
+        self._refused.clear()
         self._listener.close()
 
 
