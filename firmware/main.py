@@ -16,7 +16,7 @@ from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
 _CHUNKS = 4  # of bytes that are taken in one pass while no frame is due
-_WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board; a USB write may take 1100
+_WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board
 
 
 def _pass(board, puppet, link):

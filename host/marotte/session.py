@@ -34,7 +34,13 @@ ATTACH_TIMEOUT_S = 2.0
 """Beyond the intervals at which outputs are attached."""
 LOOK_US = 20_000
 """How often the MCU is asked while its outputs are being attached."""
-PING_US = 100_000
+PING_US = 160_000
+PINGS = 3
+"""At least so many fit into a robot's `link_timeout`."""
+STREAM_US = 160_000
+"""How often targets that change all the time are sent: six of them, with their answers, take less than 3 % of a UART at 115200
+baud. Weights follow them through two filters, which at the default `tau` let little pass that is quicker.
+"""
 GREETING_US = 50_000
 STEP_US = 2_000
 """Longest wait for one look at the carrier while something is expected."""
@@ -81,6 +87,8 @@ class Session:
         self._status: dict[str, int] = {}
         self._motor_status: dict[str, int] = {}
         self._posted_us = carrier.now_us()
+        self._stream: dict[int, int] = {}  # targets that wait for their turn
+        self._streamed_us = self._posted_us - STREAM_US
 
     def open(self, timeout_s: float = OPEN_TIMEOUT_S) -> None:
         """Greet the MCU, at first or again. Raises LinkSilent if nothing answers in time, LinkForeign if something else does."""
@@ -93,6 +101,7 @@ class Session:
                 raise self._no_welcome(timeout_s)
             carrier.write(b"\0")  # whatever was half sent before ends here
             self.link.forget()
+            self._stream = {}
             hello = {"protocol": messages.PROTOCOL, "dictionary": DICTIONARY}
             self._post("hello", hello, on_refused=lambda status, _: refused.append(status))
             again_us = min(carrier.now_us() + GREETING_US, end_us)
@@ -255,6 +264,20 @@ class Session:
         items = [{"action": action, "target_q28": target} for action, target in targets_q28.items()]
         self._post_items("weight_targets", frame, items, on_refused, "action")
 
+    def stream_weights(self, targets_q28: dict[int, int]) -> None:
+        """Send weight targets that change all the time, as those of sliders do, to act at once.
+
+        They go out if none have for STREAM_US, else then, the newest of each action; the last ones always.
+        """
+        self._stream.update(targets_q28)
+        self._send_stream()
+
+    def _send_stream(self, at_once: bool = False) -> None:
+        if self._stream and (at_once or self.carrier.now_us() - self._streamed_us >= STREAM_US):
+            self._streamed_us = self.carrier.now_us()
+            targets_q28, self._stream = self._stream, {}
+            self.weight_targets(formats.FRAME_NOW, targets_q28)
+
     def live_targets(
         self, frame: int, targets_q28: dict[int, int], on_refused: Callable[[int, int], None] | None = None
     ) -> None:
@@ -299,9 +322,16 @@ class Session:
 
     def pump(self, wait_us: int) -> None:
         """Let at most `wait_us` pass, take what has come, keep the link alive."""
-        if self.carrier.now_us() - self._posted_us >= PING_US:
+        self._send_stream()
+        if self.carrier.now_us() - self._posted_us >= self._ping_us:
             self._post("ping")
         self.link.pump(wait_us)
+
+    @property
+    def _ping_us(self) -> int:
+        if self._tables is None:
+            return PING_US
+        return min(PING_US, round(self._tables.robot.link_timeout_s * 1e6 / PINGS))
 
     def flush(self, timeout_s: float = 1.0) -> None:
         """Wait until every command is acknowledged, `timeout_s` at most for the next one that is."""
@@ -314,6 +344,7 @@ class Session:
 
     def _flushing(self, timeout_s: float, complaint: str) -> Iterator[int]:
         """Let moments pass until every command is acknowledged; yield how many are not."""
+        self._send_stream(at_once=True)
         before = end_us = 0
         while pending := self.link.pending:
             if pending != before:

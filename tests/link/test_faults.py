@@ -167,6 +167,43 @@ def test_link_has_recovered_100_ms_after_the_worst_of_each_fault(kind, way):
     assert max(took_us) <= RECOVERED_US
 
 
+# ---- what it costs
+
+
+BAUD = 115_200
+CHARACTER_BITS = 10
+SHARE = 0.03
+STREAMED_S = 20
+
+
+@pytest.mark.parametrize("how", ["stream", "each frame"])
+def test_six_targets_at_30_hz_take_little_of_a_slow_line(how):
+    """With what the MCU answers. As a stream they are less than 3 %; anew in each frame they are what packets of 42 bytes are."""
+    rng = random.Random(how)
+    with UnixMcu() as mcu:
+        line = FaultyLine(mcu)
+        session = open_session(line)
+        begin(session, TABLES)
+        sent, answered, begun_us = line.bytes_to, line.bytes_from, mcu.now_us
+        for _ in range(STREAMED_S * 30):
+            targets = {action: rng.randrange(1, formats.WEIGHT_MAX + 1) >> 16 << 16 for action in range(TARGETS)}
+            if how == "stream":
+                session.stream_weights(targets)
+            else:
+                session.weight_targets(formats.FRAME_NOW, targets)
+            play(session, FRAME_US, STEP_US)
+        to, back = (
+            count * CHARACTER_BITS / (BAUD * (mcu.now_us - begun_us) / 1e6)
+            for count in (line.bytes_to - sent, line.bytes_from - answered)
+        )
+        print(f"six targets at 30 Hz, {how}: {to:.2%} of the line to the MCU, {back:.2%} of the line from it")
+        play(session, SETTLED_US)
+        session.telemetry(0, 0, 1)
+        play(session, 2 * FRAME_US)
+        assert session.weights[1] == {action: target >> 16 for action, target in targets.items() if target >> 16}
+    assert to + back < (SHARE if how == "stream" else 0.15)
+
+
 # ---- the same on the RP2040, on lines that take their time
 
 

@@ -19,9 +19,10 @@ from marotte.link import (
     pack,
     wire_packet,
 )
-from marotte.session import DICTIONARY, OPEN_TIMEOUT_S, LinkForeign, Session
+from marotte.session import DICTIONARY, OPEN_TIMEOUT_S, PING_US, LinkForeign, Session
 from shared import formats, messages
 from tests.link.carriers import ScriptedCarrier, ack
+from tests.link.safety import puppet_text, tables_of
 
 STEP_US = 1000
 DELAY_US = 3000
@@ -366,8 +367,18 @@ def test_session_pings_when_it_has_nothing_to_say():
     for _ in range(500):
         session.pump(2000)
     pings = [at_us for message_id, _, at_us in carrier.arrived if message_id == messages.PING]
-    assert 9 <= len(pings) <= 10
+    assert len(pings) == 1_000_000 // PING_US
     assert max(b - a for a, b in itertools.pairwise(pings)) < 200_000
+
+
+def test_session_pings_more_often_where_the_mcu_is_soon_to_find_the_link_silent():
+    carrier = ScriptedCarrier(faithful)
+    session = Session(carrier)
+    session._tables = tables_of(puppet_text(["A"]), "link_timeout = 0.1")
+    for _ in range(500):
+        session.pump(2000)
+    pings = [at_us for message_id, _, at_us in carrier.arrived if message_id == messages.PING]
+    assert max(b - a for a, b in itertools.pairwise(pings)) < 40_000
 
 
 def test_session_splits_targets_into_messages_that_fit():
