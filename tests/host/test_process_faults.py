@@ -49,7 +49,13 @@ def files(tmp_path):
     """The arguments of `marotte run` for a puppet with a head that nods and a wheel that turns."""
     for name, text in (("puppet", PUPPET), ("robot", ROBOT), ("score", SCORE)):
         (tmp_path / f"{name}.toml").write_text(text)
-    return [str(tmp_path / "puppet.toml"), "--score", str(tmp_path / "score.toml"), "--robot", str(tmp_path / "robot.toml")]
+    return [
+        str(tmp_path / "puppet.toml"),
+        "--score",
+        str(tmp_path / "score.toml"),
+        "--robot",
+        str(tmp_path / "robot.toml"),
+    ]
 
 
 @contextlib.contextmanager

@@ -18,7 +18,9 @@ ROUNDS = {0.01: 6, 0.05: 1, 0.2: 1}
 
 TARGETS = 6
 TABLES = tables_of(
-    puppet_text(["A"], more="") + "".join(f'[action.A{n}]\ntau = 0.05\nmap = [["A", 0, 1, "rsin"]]\n' for n in range(TARGETS)), ""
+    puppet_text(["A"], more="")
+    + "".join(f'[action.A{n}]\ntau = 0.05\nmap = [["A", 0, 1, "rsin"]]\n' for n in range(TARGETS)),
+    "",
 )
 LASTS_US = (3_000, 17_000, 31_000, 49_000, 52_000, 77_000, 99_000, 140_000, 260_000, 510_000, 900_000)
 SETTLED_US = 1_000_000
@@ -129,7 +131,9 @@ def perform(make_mcu, kind, way, rate, seed=0, frames=FRAMES):
 @pytest.mark.parametrize("rate", RATES)
 def test_weights_become_the_last_targets_sent_over_a_bad_line(kind, way, rate):
     line, recovered_us, counters = perform(UnixMcu, kind, way, rate)
-    print(f"{kind} {way} {rate}: recovered in {recovered_us / 1000:.0f} ms, {counters.repeated} of {counters.sent} repeated")
+    print(
+        f"{kind} {way} {rate}: recovered in {recovered_us / 1000:.0f} ms, {counters.repeated} of {counters.sent} repeated"
+    )
     assert recovered_us <= RECOVERED_US
 
 

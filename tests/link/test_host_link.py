@@ -403,5 +403,7 @@ def test_session_sends_the_newest_of_the_targets_that_wait():
     session.flush()
     sent = [message_id for message_id, _, _ in carrier.arrived][WINDOW:]
     assert sent.count(messages.LIVE_TARGETS) == 1, "one for all"
-    assert sent.count(messages.WEIGHT_TARGETS) == 5 + 2, "stamped ones are sent all, and of the others what is not superseded"
+    assert sent.count(messages.WEIGHT_TARGETS) == 5 + 2, (
+        "stamped ones are sent all, and of the others what is not superseded"
+    )
     assert refused == []

@@ -140,7 +140,9 @@ def test_command_after_a_gap_is_answered_with_the_number_expected(mcu):
 
 
 def hello(seq):
-    return wire_packet(messages.HELLO, seq & 255, pack("hello", {"protocol": messages.PROTOCOL, "dictionary": DICTIONARY}))
+    return wire_packet(
+        messages.HELLO, seq & 255, pack("hello", {"protocol": messages.PROTOCOL, "dictionary": DICTIONARY})
+    )
 
 
 def test_greeting_that_was_repeated_or_overtaken_on_its_way_begins_no_session(mcu):

@@ -220,7 +220,9 @@ class Show:
                 ("live_targets", "live", len(puppet.lives)),
             ):
                 items = [{index: place, "target_q28": level} for place in range(count)]
-                for start in range(0, count, 15):  # each by itself: a session would leave out what a later one supersedes
+                for start in range(
+                    0, count, 15
+                ):  # each by itself: a session would leave out what a later one supersedes
                     part = (name, {"frame": formats.FRAME_NOW}, items[start : start + 15])
                     post(self.session, [part])
 
