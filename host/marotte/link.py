@@ -299,7 +299,7 @@ class Link:
         self.counters.sent += 1
 
     def _repeat_late(self, now_us: int) -> None:
-        """Repeat the first command if it has no answer for too long, the answer to which tells of the rest; and those that are urgent."""
+        """Repeat the first command if it has no answer for too long, as that tells of the rest, and those that are urgent."""
         first = self._under_way[0]
         for command in list(self._under_way):
             if (command is first or command.urgent) and now_us - command.sent_us > RETRY_US:

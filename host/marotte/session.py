@@ -259,7 +259,7 @@ class Session:
     ) -> None:
         """Send weight targets by index of action, to act in `frame` or at once (FRAME_NOW).
 
-        What is to act at once takes the place of older targets that were, for the same actions, if the line has not taken them yet.
+        What is to act at once takes the place of older targets of that kind for the same actions that have not left yet.
         """
         items = [{"action": action, "target_q28": target} for action, target in targets_q28.items()]
         self._post_items("weight_targets", frame, items, on_refused, "action")

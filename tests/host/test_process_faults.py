@@ -25,7 +25,7 @@ from marotte.mcu.unix import UnixMcu
 from marotte.ports import PortVanished, SerialCarrier
 from marotte.session import Session
 from shared import formats
-from tests.link.safety import play, puppet_text, tables_of
+from tests.link.safety import play, puppet_text
 from tests.link.stage import open_session, pet_tables
 
 PATIENCE_S = 60
@@ -139,7 +139,7 @@ def test_host_that_was_suspended_plays_on(files):
         continued_us = live.mcu.now_us
         out, err = process.communicate(timeout=PATIENCE_S)
         assert (process.returncode, err) == (0, "")
-        assert re.search(r"played: 2\d\d frames, 0 late", out)
+        assert int(re.search(r"played: (\d+) frames, 0 late", out)[1]) >= 240
         live.stop()
         turned = turned_us(live)
         before = [t_us for t_us in turned if t_us < continued_us]
@@ -158,7 +158,7 @@ def test_second_host_on_a_port_is_told_that_it_is_in_use(files, port):
         assert second.stderr == f"marotte: {live.url}: another program uses this port; close it first\n"
         out, err = first.communicate(timeout=PATIENCE_S)
         assert (first.returncode, err) == (0, "")
-        assert re.search(r"played: 1[89]\d frames, 0 late", out)
+        assert int(re.search(r"played: (\d+) frames, 0 late", out)[1]) >= 180
 
 
 class Tapped(VirtualCarrier):
@@ -285,7 +285,7 @@ def test_connection_that_died_without_a_word_is_noticed_at_both_ends(files, monk
             there_us = live.mcu.now_us
             proxy.is_mute = True
             gone_us = live.mcu.now_us
-            out, err = process.communicate(timeout=PATIENCE_S)
+            _, err = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 1
         assert err == f"marotte: {proxy.url}: the MCU has not answered for 1 s (unplugged, or reset?)\n"
         let_pass(live, MOMENT_US)

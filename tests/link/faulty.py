@@ -13,8 +13,8 @@ HELD_US = 40_000
 class Direction:
     """One direction of a line. `kind` is one of FAULTS, `rate` the share of packets that it hits; `done` counts hits.
 
-    A packet is what the host sends at once, or what the MCU sends up to a zero. Of stalls and cuts, `rate` is the share of packets with which one begins; of "noise" it
-    is the share of bytes.
+    A packet is what the host sends at once, or what the MCU sends up to a zero. Of stalls and cuts, `rate` is the share
+    of packets with which one begins; of "noise" it is the share of bytes.
     """
 
     def __init__(self, kind, rate, seed):
@@ -27,7 +27,7 @@ class Direction:
         self._until_us = 0
 
     def carry(self, now_us, data):
-        """Return what arrives of a packet, and of those held back before it, and when: `(at_us, data)` in the order of arrival."""
+        """Return what arrives of a packet, and of one held back before it, and when: `(at_us, data)` in the order of arrival."""
         held = [] if self._held is None else [self._held[1]]
         self._held = None
         parts = self._hit(self, now_us, data) if self.is_on else [(now_us, data)]

@@ -47,7 +47,7 @@ class Endpoint(ABC):
 
 
 class TcpEndpoint(Endpoint):
-    """A TCP port of this machine (127.0.0.1). A second client is told that the port is in use, and let go, unless the first is mute.
+    """A TCP port of this machine (127.0.0.1). A second client is told that it is in use, and let go, unless the first is mute.
 
     Raises MarotteError if the port (0: any) is taken or not allowed.
     """
