@@ -163,7 +163,7 @@ def test_greeting_with_the_number_of_the_last_one_begins_a_session_later(mcu):
     session.link.post("ping")
     session.flush()
     mcu.run_for(600_000)
-    mcu.send(hello(greeting) + wire_packet(messages.PING, (greeting + 1) & 255, b""))
+    mcu.send(hello(greeting) + wire_packet(messages.STOP, (greeting + 1) & 255, b""))  # where a ping was before
     mcu.run_for(10_000)
     answers = [body for _, body in mcu.receive()]
     assert acknowledged(answers[0]) == (greeting & 255, messages.OK, 0)
