@@ -87,6 +87,7 @@ class Session:
         self._status: dict[str, int] = {}
         self._motor_status: dict[str, int] = {}
         self._posted_us = carrier.now_us()
+        self._ping_us = PING_US
         self._stream: dict[int, int] = {}  # targets that wait for their turn
         self._streamed_us = self._posted_us - STREAM_US
 
@@ -131,7 +132,7 @@ class Session:
                 progress(max(0, len(parts) - pending), len(parts))
         if refused:
             raise refused[0]
-        self._tables = tables
+        self._plays(tables, parts[0])
 
     def exchange(self, tables: Tables, playing: Puppet) -> None:
         """Replace the tables of a puppet that moves, between two frames.
@@ -149,7 +150,12 @@ class Session:
         end_us = self.carrier.now_us() + round(UPLOAD_TIMEOUT_S * 1e6)
         while self._post_all([begin]):  # refused as long as the exchange is being prepared
             self._step(end_us, "the exchange of tables was not carried out")
+        self._plays(tables, begin)
+
+    def _plays(self, tables: Tables, begin: Command) -> None:
+        """Note which tables the MCU plays now, and how soon it finds the link silent, which their first message says."""
         self._tables = tables
+        self._ping_us = min(PING_US, begin[1]["link_timeout_ms"] * 1000 // PINGS)
 
     def _post_all(self, group: list[Command], timeout_s: float = UPLOAD_TIMEOUT_S) -> list[LinkRefused]:
         """Send commands, wait until all are answered; return what the MCU refused."""
@@ -326,12 +332,6 @@ class Session:
         if self.carrier.now_us() - self._posted_us >= self._ping_us:
             self._post("ping")
         self.link.pump(wait_us)
-
-    @property
-    def _ping_us(self) -> int:
-        if self._tables is None:
-            return PING_US
-        return min(PING_US, round(self._tables.robot.link_timeout_s * 1e6 / PINGS))
 
     def flush(self, timeout_s: float = 1.0) -> None:
         """Wait until every command is acknowledged, `timeout_s` at most for the next one that is."""

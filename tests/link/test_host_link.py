@@ -374,7 +374,7 @@ def test_session_pings_when_it_has_nothing_to_say():
 def test_session_pings_more_often_where_the_mcu_is_soon_to_find_the_link_silent():
     carrier = ScriptedCarrier(faithful)
     session = Session(carrier)
-    session._tables = tables_of(puppet_text(["A"]), "link_timeout = 0.1")
+    session.upload(tables_of(puppet_text(["A"]), "link_timeout = 0.1"))
     for _ in range(500):
         session.pump(2000)
     pings = [at_us for message_id, _, at_us in carrier.arrived if message_id == messages.PING]
