@@ -28,7 +28,7 @@ _CHUNK = const(32)  # bytes taken between two looks at the frame clock; one cost
 _STALE_US = const(20000)  # a partial packet older than this is dropped
 _HISTORY = const(16)  # answers kept for repeated commands; the host has fewer under way
 _GREETINGS = const(8)  # a greeting with one of the last so many numbers ..
-_GREETING_US = const(500000)  # .. within this time is one that was repeated or overtaken
+_GREETING_US = const(150000)  # .. within this time is one that was repeated or overtaken
 _PAYLOAD = const(2)  # place of the payload in a body
 
 _WELCOME_FIELDS = messages.find(messages.WELCOME)[2]

@@ -48,7 +48,9 @@ def perform(board, room=None):
     `room` is a list with a buffer at the low end of the heap, which is freed then: what is allocated later, for a moment, is
     found there without a search through all that stays.
     """
+    gc.collect()
     puppet = Puppet(board)
+    gc.collect()  # garbage between what stays would leave a heap full of holes
     motor = puppet.motor
     link = Link(board, puppet)
     try:

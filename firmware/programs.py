@@ -94,8 +94,26 @@ def _evaluate(
     samples_q15: ptr16,
     stack: ptr32,
     value_q15: ptr16,
+    frames: int,
+    curve_mean_q15: ptr16,
+    spacing_q2: ptr16,
+    pace_q22: ptr32,
+    fade_q15: ptr16,
+    weight_course_q28: ptr32,
+    mapped_dof: ptr8,
+    signal: ptr8,
+    low_q15: ptr16,
+    high_q15: ptr16,
+    shift: ptr8,
+    numerator: ptr32,
+    denominator: ptr32,
 ):
-    """Write the values of all programs of the playing actions.
+    """Write the values of all programs of the playing actions to `value`, if `frames` is 0.
+
+    Else the phases are those of a block of so many frames, up to 16 (see `outlook`), 16 places for each action of the list, the live
+    channels have 16 places each too, and the values are added to the sums of their DOFs as in `foresight`. Where `spacing[b]` is not 0 the
+    frame is one of a sketch, and what is periodic counts for less, the farther it gets on its way to the next one: `pace[n]`
+    is the part of a cycle by which a frame moves action `n` of the list on.
 
     Values are Q16 and saturate at -16..16; on the stack they stand with 2^21 added. A phase `a * t + b` is `a_q4` times
     the fraction in Q22, within 2^30, in sixteenths of whole cycles. Bits: a product has limbs of 11 + 10
@@ -107,7 +125,22 @@ def _evaluate(
         m = int(first_mapping[i])
         end = m + int(mappings[i])
         while m < end:
-            if function[m] == _PROGRAM and int(same[m]) == m:
+            d = int(mapped_dof[m])
+            b = 16
+            if function[m] == _PROGRAM:
+                if frames:
+                    if signal[d]:
+                        b = 0
+                elif int(same[m]) == m:
+                    b = 0
+            while b < 16:
+                live = 0
+                phase = i
+                spacing = 0
+                if frames:
+                    live = 4
+                    phase = (n << 4) + b
+                    spacing = int(spacing_q2[b])
                 p = int(argument[m])
                 at = int(program_start[p])
                 last = at + int(program_words[p])
@@ -123,8 +156,9 @@ def _evaluate(
                             at += 1
                         a = pool[at] - 256
                         at += 1
-                        whole = a * int(cycle[i])
-                        u = ((whole & 15) << 22) + a * ((fraction_q24[i] + 2) >> 2)
+                        mean = k
+                        whole = a * int(cycle[phase])
+                        u = ((whole & 15) << 22) + a * ((fraction_q24[phase] + 2) >> 2)
                         whole = whole >> 4
                         if code == _NOISE:
                             whole = whole + pool[at]
@@ -154,17 +188,28 @@ def _evaluate(
                             if y == x:
                                 y = 0
                             v = (w << 1) + (((int(samples_q15[k + y]) - w) * u + 0x2000) >> 14)
+                            mean = int(curve_mean_q15[mean]) << 1
                         else:
                             if code == _RCOS:
                                 u = (u + 0x1000000) & 0x3FFFFFF
                             x = u >> 17
                             w = int(sine[x])
                             v = (w << 1) + (((int(sine[x + 1]) - w) * ((u >> 2) & 0x7FFF) + 0x2000) >> 14)
+                        if spacing:
+                            if code != _CURVE:
+                                mean = 32768
+                            x = ((a * pace_q22[n]) >> 4) & 0x3FFFFF
+                            if x > 0x200000:
+                                x = 0x400000 - x
+                            x = (x * spacing) >> 18
+                            y = int(fade_q15[x]) if x < 64 else 0
+                            v = mean + ((((v - mean) >> 1) * y) >> 14)
                     elif code == _CONST:
                         v = pool[at] - _LIMIT
                         at += 1
                     elif code == _LIVE:
-                        v = (live_q28[pool[at]] + 0x800) >> 12
+                        k = (pool[at] << live) + (b if live else 0)
+                        v = (live_q28[k] + 0x800) >> 12
                         at += 1
                     else:
                         top -= 1
@@ -225,7 +270,18 @@ def _evaluate(
                     v = 0
                 if v > 32768:
                     v = 32768
-                value_q15[m] = v
+                if frames:
+                    low = int(low_q15[m])
+                    w = weight_course_q28[phase] >> int(shift[d])
+                    k = (d << 4) + b
+                    denominator[k] = denominator[k] + w
+                    numerator[k] = numerator[k] + w * (low + (((int(high_q15[m]) - low) * v + 0x4000) >> 15))
+                    b += 1
+                    if b == frames:
+                        b = 16
+                else:
+                    value_q15[m] = v
+                    b = 16
             m += 1
         n += 1
 
@@ -238,11 +294,27 @@ class Programs:
 
     def evaluate(self, tables, actions, sine, gradients, live_q28, value_q15):
         """Write the values of all programs of the playing actions to `value_q15`."""
+        t = tables
+        none = self._stack
         # fmt: off
         _evaluate(
-            actions.playing, actions.found, actions.cycle, actions.fraction_q24, tables.first_mapping,
-            tables.mapping_count, tables.function, tables.argument, tables.same, tables.program_start,
-            tables.program_words, tables.pool, sine, gradients, live_q28, tables.curve_start, tables.curve_samples,
-            tables.samples_q15, self._stack, value_q15,
+            actions.playing, actions.found, actions.cycle, actions.fraction_q24, t.first_mapping, t.mapping_count,
+            t.function, t.argument, t.same, t.program_start, t.program_words, t.pool, sine, gradients, live_q28,
+            t.curve_start, t.curve_samples, t.samples_q15, self._stack, value_q15, 0, sine, sine, none, sine, none,
+            t.mapped_dof, t.signal, t.low_q15, t.high_q15, t.signal, none, none,
+        )
+        # fmt: on
+
+    def add(self, tables, outlook, sine, gradients, frames, spacing_q2, fade_q15, shift, numerator, denominator):
+        """Add the values of all programs in a block of frames to the sums of their DOFs, for `foresight`."""
+        t = tables
+        o = outlook
+        # fmt: off
+        _evaluate(
+            o.playing, o.found, o.cycle_course, o.fraction_course_q24, t.first_mapping, t.mapping_count,
+            t.function, t.argument, t.same, t.program_start, t.program_words, t.pool, sine, gradients,
+            o.live_course_q28, t.curve_start, t.curve_samples, t.samples_q15, self._stack, sine, frames,
+            t.curve_mean_q15, spacing_q2, o.pace_q22, fade_q15, o.weight_course_q28, t.mapped_dof, t.signal,
+            t.low_q15, t.high_q15, shift, numerator, denominator,
         )
         # fmt: on

@@ -110,7 +110,7 @@ class Stage:
         speed_q24 = int(SPEED * tick_s * formats.POSITION_ONE)
         accel_q24 = int(ACCEL * tick_s**2 * formats.POSITION_ONE)
         for dof in range(DOFS):
-            limits = (0, formats.VALUE_ONE, speed_q24, accel_q24)
+            limits = (0, formats.VALUE_ONE, speed_q24, accel_q24, int(blinks == 0))
             yield _message("dof", dof, formats.KIND_ABSOLUTE, formats.VALUE_ONE // 2, *limits)
         for dof in range(DOFS):
             if self.has_characters:
@@ -126,7 +126,7 @@ class Stage:
             values = [self._mapping(action, number) for number in range(MAPPINGS)]
             entries = [dict(zip(items, entry, strict=True)) for entry in values]
             yield "mappings", {"first_mapping": MAPPINGS * action}, entries
-        yield _message("live", 0, formats.WEIGHT_ONE // 2, alpha_q26, alpha_q26)
+        yield _message("live", 0, formats.WEIGHT_ONE // 2, alpha_q26, alpha_q26, formats.PREDICT_HOLD, 0, 0, 0)
         for curve in range(curves):
             samples = [{"value_q15": 500 * n + curve} for n in range(CURVE_SAMPLES)]
             yield "curve", {"curve": curve, "samples": CURVE_SAMPLES}, samples

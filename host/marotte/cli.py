@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from marotte import check, commands, curves, emulated
+from marotte import check, commands, curves, emulated, plotting
 from marotte.errors import MarotteError
 from marotte.files import Watch, load, load_pair
 from marotte.tomlfile import FileMistakes, did_you_mean
@@ -60,8 +60,9 @@ def _parser() -> argparse.ArgumentParser:
         prog="marotte", description="Puppets that live on their own microcontroller, directed over a serial link."
     )
     commands_ = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_check, _add_render, _add_run, _add_save, _add_calibrate, _add_ports, _add_mcu, _add_import_curve):
+    for add in (_add_check, _add_render, _add_plot, _add_run, _add_save, _add_calibrate, _add_ports, _add_mcu):
         add(commands_)
+    _add_import_curve(commands_)
     return parser
 
 
@@ -113,6 +114,26 @@ def _add_render(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--seconds", type=_seconds, required=True, help="length of the rendering")
     parser.add_argument("--mcu", choices=emulated.KINDS, required=True, help="the emulated MCU to render on")
     parser.add_argument("--out", required=True, metavar="FILE.csv", help="the file to write")
+
+
+def _add_plot(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands_,
+        "plot",
+        "play a score on an emulated MCU in virtual time and draw DOFs, their spectra and the weights",
+        _plot,
+        "marotte plot puppets/pet.toml --score puppets/pet-score.toml --seconds 20 --out pet.png",
+        "marotte plot puppets/pet.toml --score puppets/pet-score.toml --seconds 20 --dof NECK HEAD_YAW --out neck.svg",
+    )
+    _add_files(parser)
+    parser.add_argument("--seconds", type=_seconds, required=True, help="length of the rendering")
+    parser.add_argument(
+        "--dof", nargs="+", metavar="NAME", help=f"the DOFs to draw (default: the {plotting.DOFS} that move most)"
+    )
+    parser.add_argument(
+        "--mcu", choices=emulated.KINDS, default="unix", help="the emulated MCU to render on (default: %(default)s)"
+    )
+    parser.add_argument("--out", type=_picture, required=True, metavar="FILE.png|.svg", help="the file to write")
 
 
 def _add_run(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -246,6 +267,14 @@ def _seconds(text: str) -> Fraction:
     return seconds
 
 
+def _picture(text: str) -> Path:
+    if Path(text).suffix.lower() not in plotting.SUFFIXES:
+        raise argparse.ArgumentTypeError(
+            f"found {text!r}, expected a name that ends in {' or '.join(plotting.SUFFIXES)}"
+        )
+    return Path(text)
+
+
 def _frame_rate(text: str) -> float:
     try:
         rate_hz = float(text)
@@ -289,6 +318,18 @@ def _check(options: argparse.Namespace) -> int:
 def _render(options: argparse.Namespace) -> int:
     files = load(options.puppet, options.score, options.robot)
     commands.render_to_csv(files, options.seconds, options.mcu, Path(options.out), Console(stderr=True))
+    return FINE
+
+
+def _plot(options: argparse.Namespace) -> int:
+    if not plotting.is_possible():
+        return _failed(f"marotte: {plotting.MISSING}", MISTAKE)
+    files = load(options.puppet, options.score, options.robot)
+    for name in options.dof or ():
+        if name not in files.puppet.dofs:
+            hint = did_you_mean(name, files.puppet.dofs)
+            return _failed(f"marotte: {options.puppet} has no DOF {name!r}{hint}", MISTAKE)
+    commands.plot_to_file(files, options.seconds, options.mcu, options.dof, options.out, Console(stderr=True))
     return FINE
 
 

@@ -6,10 +6,11 @@ import contextlib
 import queue
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -31,6 +32,9 @@ from marotte.tables import build_tables
 from marotte.view import View
 from marotte.wiring import Robot
 
+if TYPE_CHECKING:
+    from marotte.rendering import Rendering
+
 PUMP_US = 20_000
 GONE = {"rest": "goes to rest", "relax": "goes to rest and lets go"}
 """What a puppet does when the host is gone, by its `when_silent`; with any other it goes on."""
@@ -38,9 +42,34 @@ GONE = {"rest": "goes to rest", "relax": "goes to rest and lets go"}
 
 def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console: Console) -> None:
     """Render into a file, with a progress bar, and tell about the run. Raises MarotteError."""
-    from marotte.rendering import frame_count, render
+    _require_writable(out)
+    rendering = _render(files, seconds, mcu, console)
+    rendering.write_csv(out)
+    print(f"{out}: {len(rendering.frames)} frames, {len(files.puppet.dofs)} DOFs")
+    for key, value in rendering.report.items():
+        print(f"  {key}: {value:,}" if isinstance(value, int) else f"  {key}: {value}")
+    if rendering.status["clipped"]:
+        print(f"  {clipping(rendering.status)}")
+
+
+def plot_to_file(
+    files: Files, seconds: Fraction, mcu: str, dofs: Sequence[str] | None, out: Path, console: Console
+) -> None:
+    """Render, with a progress bar, and draw it into a PNG or SVG file. Raises MarotteError."""
+    from marotte.plotting import plot, save_figure
 
     _require_writable(out)
+    rendering = _render(files, seconds, mcu, console, weights=True)
+    with console.status("drawing") if console.is_terminal else contextlib.nullcontext():
+        save_figure(plot(rendering, files.score, dofs), out)
+    print(f"{out}: {len(rendering.frames)} frames")
+    if rendering.status["clipped"]:
+        print(f"  {clipping(rendering.status)}")
+
+
+def _render(files: Files, seconds: Fraction, mcu: str, console: Console, weights: bool = False) -> Rendering:
+    from marotte.rendering import frame_count, render
+
     bar = Progress(
         TextColumn("rendering on {task.description}"),
         BarColumn(),
@@ -52,18 +81,20 @@ def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console:
     )
     with bar:
         task = bar.add_task(mcu, total=frame_count(seconds, files.puppet.frame_rate_hz))
-        rendering = render(
+        return render(
             files.puppet,
             files.score,
             seconds,
             mcu,
             files.robot,
             progress=lambda done, of: bar.update(task, completed=done, total=of),
+            weights=weights,
         )
-    rendering.write_csv(out)
-    print(f"{out}: {len(rendering.frames)} frames, {len(files.puppet.dofs)} DOFs")
-    for key, value in rendering.report.items():
-        print(f"  {key}: {value:,}" if isinstance(value, int) else f"  {key}: {value}")
+
+
+def clipping(status: dict[str, int]) -> str:
+    """Return how often signal processing went out of the range of a DOF, as a status says."""
+    return f"{status['clipped']:,} values clipped by signal processing: the gains are high for where the motion is"
 
 
 @dataclass(frozen=True)
@@ -263,7 +294,8 @@ def _perform(files: Files, carrier: SerialCarrier, where: str, options: RunOptio
     how = "stopped by hand" if performance.is_interrupted else "played"
     late = f", {status['late_frames']} late, at most {status['late_max_us']} us" if status else ""
     errors = f"; {status['bus_errors']} errors on the I2C bus" if status.get("bus_errors") else ""
-    console.print(f"{how}: {performance.frames} frames{late}{errors}; outputs are off", highlight=False)
+    clipped = f"; {clipping(status)}" if status.get("clipped") else ""
+    console.print(f"{how}: {performance.frames} frames{late}{errors}{clipped}; outputs are off", highlight=False)
     return performance.is_interrupted
 
 

@@ -193,9 +193,7 @@ class Link:
         self._answered_us = self._pumped_us = self.heard_us
         self._carrier = carrier
         self._on_message = on_message
-        self._seq = (
-            self.heard_us >> 10 & 255
-        )  # another one in each session, so that what is left of the last is not mistaken
+        self._seq = 0
         self._backlog: deque[_Command] = deque()
         self._under_way: deque[_Command] = deque()
         self._partial = b""

@@ -34,6 +34,8 @@ ATTACH_TIMEOUT_S = 2.0
 """Beyond the intervals at which outputs are attached."""
 LOOK_US = 20_000
 """How often the MCU is asked while its outputs are being attached."""
+WEIGHTS_KEPT = 64
+"""Messages with weights that wait for whoever wants them all."""
 PING_US = 160_000
 PINGS = 3
 """At least so many fit into a robot's `link_timeout`."""
@@ -74,7 +76,7 @@ class Session:
 
     `welcome` holds the fields of the MCU's greeting. `taps` collects `(frame, taps, values_q15)` as telemetry brings
     them: the values of all DOFs, base, signal and motor one after the other as far as `taps` names them. `weights` is
-    `(frame, {action: weight_q12})` of the last weights message.
+    `(frame, {action: weight_q12})` of the last weights message, `weights_seen` has the last WEIGHTS_KEPT of them.
     """
 
     def __init__(self, carrier: Carrier):
@@ -83,6 +85,7 @@ class Session:
         self.welcome: dict[str, int] = {}
         self.taps: deque[tuple[int, int, list[int]]] = deque()
         self.weights: tuple[int, dict[int, int]] = (-1, {})
+        self.weights_seen: deque[tuple[int, dict[int, int]]] = deque(maxlen=WEIGHTS_KEPT)
         self._tables: Tables | None = None
         self._status: dict[str, int] = {}
         self._motor_status: dict[str, int] = {}
@@ -297,6 +300,13 @@ class Session:
         """Set the tempo of an action by its index, or of all (MASTER), from `frame` on or at once (FRAME_NOW)."""
         self._post_items("tempo", frame, [{"action": action, "tempo_q16": tempo_q16}], on_refused)
 
+    def gains(
+        self, frame: int, gains4_q16: dict[int, int], on_refused: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Send gains of bands by index, the highest 0, from `frame` on or at once (FRAME_NOW)."""
+        items = [{"band": band, "gain4_q16": gain} for band, gain in gains4_q16.items()]
+        self._post_items("gains", frame, items, on_refused)
+
     def telemetry(self, taps: int, taps_every: int, weights_every: int) -> None:
         """Ask for taps (bits of TAP_BASE, TAP_SIGNAL, TAP_MOTOR) and weights, every so many frames; 0 is never.
 
@@ -395,6 +405,7 @@ class Session:
         elif message.name == "weights":
             weights = {item["action"]: item["weight_q12"] for item in message.items}
             self.weights = (message.fields["frame"], weights)
+            self.weights_seen.append(self.weights)
         elif message.name == "status":
             self._status = message.fields
         elif message.name == "motor_status":

@@ -20,7 +20,6 @@ from typing import Any, TypeVar
 
 from marotte.errors import MarotteError
 from marotte.positions import KeyPath, line_numbers
-from marotte.supported import NOT_YET
 
 T = TypeVar("T")
 
@@ -128,11 +127,6 @@ class Document:
         line = next((self._lines[prefix] for prefix in prefixes if prefix in self._lines), None)
         self.mistakes.append(Mistake(str(self.path), line, key_text(path), text))
 
-    def not_yet(self, path: KeyPath, feature: str) -> None:
-        """Note a mistake if this version does not perform `feature`, a key of `supported.NOT_YET`."""
-        if feature in NOT_YET:
-            self.mistake(path, f"{NOT_YET[feature]} is not supported by this version")
-
     def in_order(self) -> list[Mistake]:
         """Return the mistakes in the order of their lines, those without one last."""
         return sorted(self.mistakes, key=lambda mistake: (mistake.line is None, mistake.line or 0))
@@ -210,10 +204,6 @@ class Table:
     def mistake(self, text: str, *keys: str | int) -> None:
         """Note a mistake of the table itself, or of what `keys` lead to in it."""
         self.document.mistake((*self.path, *keys), text)
-
-    def not_yet(self, key: str, feature: str) -> None:
-        """Note a mistake at a key if this version does not perform the feature."""
-        self.document.not_yet((*self.path, key), feature)
 
     def number(self, key: str, low: float, high: float, default: float) -> float:
         """Return a number in `low`..`high`."""

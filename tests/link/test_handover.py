@@ -4,10 +4,12 @@ import itertools
 
 import pytest
 
+from marotte.link import VirtualCarrier
 from marotte.mcu.raw_repl import RawRepl
 from marotte.mcu.unix import UnixMcu
 from marotte.pulses import pulses
-from tests.link.stage import FRAME_US, begin_performance
+from marotte.session import Session
+from tests.link.stage import FRAME_US, WARM_UP_US, begin_performance
 
 RAW_BANNER = b"raw REPL; CTRL-B to exit\r\n>"
 
@@ -27,6 +29,18 @@ def performing(request):
 def answer(mcu, wait_us=300_000):
     mcu.run_for(wait_us)
     return b"".join(data for _, data in mcu.receive())
+
+
+@pytest.mark.images
+def test_bytes_that_come_while_the_firmware_starts_do_not_call_for_the_repl(rp2040_mcu):
+    """A host greets from the first moment on, and its packets have bytes 3 in them, be it the protocol's number."""
+    with rp2040_mcu() as mcu:
+        for _ in range(WARM_UP_US // 500):
+            mcu.send(b"\x03")
+            mcu.run_for(500)
+        session = Session(VirtualCarrier(mcu))
+        session.open()
+        assert session.welcome["frame"] == -1
 
 
 @pytest.mark.parametrize(

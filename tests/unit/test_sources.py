@@ -81,6 +81,8 @@ CONSTANTS = [
     ("feedback", "_ONE", formats.POSITION_ONE),
     ("guards", "_HALF", formats.POSITION_ONE // 2),
     ("driver_bridge", "_STOP_Q24", formats.POSITION_ONE // 2),
+    ("kalman", "_LIVES", formats.LIVES_MAX),
+    ("kalman", "_ONE", formats.WEIGHT_ONE),
     ("motor", "_DOFS", formats.DOFS_MAX),
     ("motor", "_STILL_Q24", formats.POSITION_ONE // 2),
     ("motor", "_CALM_PER_S", 1000 // formats.STAND_MS),
