@@ -1,7 +1,7 @@
 """More than there is time for, on the RP2040: the largest puppet, 60 frames a second, all telemetry, a line full of commands.
 
-The frame clock holds as long as frames leave time, what is too much is refused and counted, and kills act in their time. A host that does not read, or a
-line that is too slow for what is asked for, delays no frame.
+The frame clock holds as long as frames leave time, what is too much is refused and counted, and kills act in their time. A host
+that does not read, or a line that is too slow for what is asked for, delays no frame.
 """
 
 import random
