@@ -27,6 +27,7 @@ LIVE = const(1)
 TEMPO = const(2)
 GAIN = const(3)
 MASTER_INDEX = const(255)
+_REFUSED_MAX = const(0x3FFFFF00)  # where that count stays, as a larger one would need memory
 _NOW = const(128)  # added to the kind of a target that acts in the next frame and cannot be late
 
 
@@ -107,8 +108,8 @@ def _apply(
 ) -> int:
     """Let all targets stamped `frame` or earlier act; return how many wait: without `consume` all of them, and none is late.
 
-    `counts[0]` counts the late ones, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]` gets a bit
-    per live channel whose target acted.
+    `counts[0]` counts the late ones, up to 2^30 - 1, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]` gets a
+    bit per live channel whose target acted.
     """
     kept = 0
     n = 0
@@ -116,7 +117,7 @@ def _apply(
         if queue_frame[n] <= frame:
             kind = int(queue_kind[n])
             if kind < 128:
-                if queue_frame[n] < frame and consume:
+                if queue_frame[n] < frame and consume and counts[0] < 0x3FFFFFFF:
                     counts[0] = counts[0] + 1
             kind = kind & 127
             index = int(queue_index[n])
@@ -240,7 +241,8 @@ class Cues:
         items = (length - 4) // 5
         if self.count + items > QUEUE_MAX:
             self.detail = QUEUE_MAX - self.count
-            self.refused = (self.refused + items) & 0x3FFFFFFF
+            if self.refused < _REFUSED_MAX:
+                self.refused += items
             return messages.FULL
         first = least = 0
         if kind == TEMPO:

@@ -47,14 +47,15 @@ _SKETCH_US = const(1000)  # one sketch
 _SKETCH_DOF_US = const(20)
 _SKETCH_ACTION_US = const(60)
 _SKETCH_MAPPING_US = const(25)
-_SKETCH_WORD_US = const(42)
-_FRAME_US = const(10)  # one frame to come
-_FRAME_DOF_NS = const(10300)
-_FRAME_ACTION_NS = const(7500)
-_FRAME_MAPPING_NS = const(1500)
-_FRAME_WORD_NS = const(2600)
+_SKETCH_WORD_US = const(25)
+_FRAME_US = const(60)  # one frame to come
+_FRAME_DOF_NS = const(8500)
+_FRAME_ACTION_NS = const(6500)
+_FRAME_MAPPING_NS = const(1300)
+_FRAME_WORD_NS = const(1550)
 _FRAME_LIVE_NS = const(4500)
-_SKETCHES = const(4)  # sketches that must fit into a period to be made at all, as two of them are
+_BURST_US = const(5000)  # by which news may delay the next frame, if there was none in the frame before
+_SLICE_US = const(4000)  # that one portion may take
 _START_US = const(160000)  # for the future of frame 0
 
 _BEGIN = const(0)  # stages of work
@@ -71,11 +72,13 @@ def _program_words(
     found: int,
     first_mapping: ptr16,
     mappings: ptr8,
+    mapped_dof: ptr8,
+    signal: ptr8,
     function: ptr8,
     argument: ptr16,
     program_words: ptr16,
 ) -> int:
-    """Return how many words the programs of the playing actions have."""
+    """Return how many words the programs of the playing actions have, on DOFs that are processed."""
     total = 0
     n = 0
     while n < found:
@@ -83,7 +86,8 @@ def _program_words(
         m = int(first_mapping[i])
         end = m + int(mappings[i])
         while m < end:
-            if int(function[m]) == _PROGRAM:
+            d = int(mapped_dof[m])
+            if signal[d] and int(function[m]) == _PROGRAM:
                 k = int(argument[m])
                 total += int(program_words[k])
             m += 1
@@ -169,6 +173,7 @@ class Future:
         self._dof = 0
         self._has_news = False
         self._has_changed = False
+        self._had_news = False
         self._is_exchanged = False
         self._is_sketched = False
         self._is_sketchy = True  # whether there is time for sketches
@@ -191,7 +196,8 @@ class Future:
         a = puppet.actions
         a.compute_phases(tables, puppet.master, tables.frame_rate_hz)  # which lists who plays
         self._weigh(tables, a.playing, a.found)
-        self._is_sketchy = _SKETCHES * self._sketch_us * tables.frame_rate_hz < 1000000
+        need_us = _NEWS_US + _NEWS_DOF_US * tables.dofs + 2 * self._sketch_us
+        self._is_sketchy = need_us < self._left_us(tables)
         if self._is_sketchy:
             self._sketch(tables, puppet, False)
             _copy_halves(self._foresight.future_q15, self._before_q15, tables.dofs * BLOCK)
@@ -283,13 +289,14 @@ class Future:
         if self._has_news:
             self._has_news = self._is_sketched = False
             self._outlook.take(self._frame, tables, puppet)
+            self._weigh(tables, self._outlook.playing, self._outlook.found)
             self._front = self._frame
             self._has_changed = True
-        self._weigh(tables, self._outlook.playing, self._outlook.found)
-        us = 10000 * _PERIOD_PERCENT // tables.frame_rate_hz - self._fixed_us
+        us = self._left_us(tables)
         if self._stage == _BEND:
             us -= _NEWS_US + _NEWS_DOF_US * tables.dofs + 2 * self._sketch_us
         self._quota = self._portion(us)
+        self._had_news = self._has_changed
 
     def _differ(self, tables, base_q15):
         """Note what has changed at the knots; the first one is the frame that has been, whose base is known."""
@@ -329,7 +336,8 @@ class Future:
         t = tables
         # fmt: off
         words = _program_words(
-            playing, found, t.first_mapping, t.mapping_count, t.function, t.argument, t.program_words
+            playing, found, t.first_mapping, t.mapping_count, t.mapped_dof, t.signal, t.function, t.argument,
+            t.program_words,
         ) if t.programs else 0
         # fmt: on
         mappings = _load(playing, found, t.mapping_count)
@@ -338,6 +346,11 @@ class Future:
         self._sketch_us += _SKETCH_MAPPING_US * mappings + _SKETCH_WORD_US * words
         frame_ns = _FRAME_DOF_NS * t.dofs + _FRAME_ACTION_NS * found + _FRAME_MAPPING_NS * mappings
         self._frame_us = _FRAME_US + (frame_ns + _FRAME_WORD_NS * words + _FRAME_LIVE_NS * t.lives) // 1000
+
+    def _left_us(self, tables):
+        """Return what is left of a period when the frame has been computed."""
+        left_us = 10000 * _PERIOD_PERCENT // tables.frame_rate_hz - self._fixed_us
+        return left_us if self._had_news else left_us + _BURST_US
 
     def _portion(self, us):
         """Return how many frames to come are computed in a time."""
@@ -354,7 +367,8 @@ class Future:
         """Compute the next block of frames to come."""
         front = self._front
         bands.column(self._base_q15, self._row, tables.dofs, front - 1, self._column_q15)
-        frames = self._outlook.write(tables, min(BLOCK, self._quota), self._column_q15)
+        frames = min(BLOCK, self._quota, max(1, _SLICE_US // self._frame_us))
+        frames = self._outlook.write(tables, frames, self._column_q15)
         self._foresight.evaluate(tables, self._outlook, frames, 0, puppet)
         # fmt: off
         bands.put_block(
@@ -388,7 +402,7 @@ class Future:
         self._front = 1
         self._weigh(tables, self._outlook.playing, self._outlook.found)
         self._quota = self._portion(_START_US)
-        self._has_news = self._has_changed = self._is_exchanged = self._is_sketched = False
+        self._has_news = self._has_changed = self._had_news = self._is_exchanged = self._is_sketched = False
         self._stage = _COMPUTE
         self.pending = True
 
