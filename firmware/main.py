@@ -16,7 +16,7 @@ from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
 _CHUNKS = 5  # of bytes that are taken in one pass: all that a host has under way, and a kill
-_OVERDUE_US = 5000  # a frame that is so late waits for what has come, as a kill may be among it
+_OVERDUE_US = 20000  # a frame that is so late waits for what has come, as a kill may be among it
 _WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board
 
 
