@@ -118,7 +118,7 @@ class Puppet:
         self._rest()
         self.frame = 0
         self.frame_max_us = self.clipped = 0
-        self.cues.counts[0] = 0
+        self.cues.counts[0] = self.cues.refused = 0
         self._rehearsed = self.cues.arrivals
         self._is_starting = True
 
