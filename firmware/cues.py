@@ -107,8 +107,8 @@ def _apply(
 ) -> int:
     """Let all targets stamped `frame` or earlier act; return how many wait: without `consume` all of them, and none is late.
 
-    `counts[0]` counts the late ones, up to 2^30 - 1, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]` gets a
-    bit per live channel whose target acted.
+    `counts[0]` counts the late ones, up to 2^30 - 1, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]`
+    gets a bit per live channel whose target acted.
     """
     kept = 0
     n = 0
@@ -204,8 +204,8 @@ class Cues:
 
     `counts[0]` counts targets that came after their frame and acted at once, `counts[1]` tempos of actions that acted.
     `counts[2]` counts the targets of the last frame that change what is to come, that is all but gains; `counts[3]` has a
-    bit per live channel that got a target in it. `arrivals` moves on with every payload that is queued. `detail` explains the last refusal: the number of the bad field, or the
-    free places.
+    bit per live channel that got a target in it. `arrivals` moves on with every payload that is queued. `detail` explains the
+    last refusal: the number of the bad field, or the free places.
     """
 
     def __init__(self):
