@@ -108,8 +108,8 @@ def _apply(
 ) -> int:
     """Let all targets stamped `frame` or earlier act; return how many wait: without `consume` all of them, and none is late.
 
-    `counts[0]` counts the late ones, up to 2^30 - 1, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]` gets a
-    bit per live channel whose target acted.
+    `counts[0]` counts the late ones, up to 2^30 - 1, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]`
+    gets a bit per live channel whose target acted.
     """
     kept = 0
     n = 0

@@ -137,8 +137,9 @@ class Puppet:
     def prepare(self):
         """Take a step of what is to be done between frames; return whether there was one to take.
 
-        That is the future that signal processing wants to know, and then an exchange of tables. The last two steps of that collect what tables leave on the heap, so that it does not fill up in the middle of a frame, and put the
-        new tables into force. They wait until there is time for that.
+        That is the future that signal processing wants to know, and then an exchange of tables. The last two steps of that
+        collect what tables leave on the heap, so that it does not fill up in the middle of a frame, and put the new tables into
+        force. They wait until there is time for that.
         """
         if self.future.pending:
             micropython.heap_lock()  # as in a frame
