@@ -5,9 +5,6 @@
 frame, of 5, 13, 29 and 61 taps, so two rings are kept: the base from the past through the present to the future, and its
 `G_3`. That takes 38 products per DOF and frame where a filter of the base takes 255.
 
-When the future changes, the bands change by a linear function of that change. Where it is piecewise linear between knots, so many
-frames ahead, that is a table of 7 times 16 numbers, `change_table`. The knots are the same for all.
-
 Source: SPEC of motion signal processing; Bruderlin and Williams, Motion Signal Processing (1995).
 """
 
@@ -49,35 +46,6 @@ def tap_table():
     for kernel in _kernels(4)[1:]:
         for value in kernel[len(kernel) // 2 :]:
             table.append(value)
-    return table
-
-
-def change_table(knots, late):
-    """Return by how much a change of the future at each knot changes `G_1 .. G_7`, 7 times 16 words in Q15 with 2^16 added.
-
-    A change has its value at a knot, goes straight to 0 on the way to the knots beside it, and there is none before the first knot.
-    `late` is 0 for the levels in the frame from which the knots count, 1 for those in the frame behind it. Allocates.
-    """
-    table = array("i", [_DELTA_ZERO] * (BANDS * len(knots)))
-    for level, kernel in enumerate(_kernels(BANDS)[1:]):
-        middle = len(kernel) // 2
-        for number, knot in enumerate(knots):
-            first = knots[number - 1] if number else knot
-            if first - late > middle:
-                break
-            last = knots[number + 1] if number + 1 < len(knots) else knot
-            total = 0  # in 2^-12 of the kernel's units
-            for frame in range(first, last + 1):
-                place = frame - late + middle
-                if 0 <= place < len(kernel):
-                    share = 4096
-                    if frame < knot:
-                        share = 4096 * (frame - first) // (knot - first)
-                    elif frame > knot:
-                        share = 4096 * (last - frame) // (last - knot)
-                    total += share * kernel[place]
-            shift = 4 * (level + 1) + 12 - 15
-            table[level * len(knots) + number] += (total + (1 << shift - 1)) >> shift
     return table
 
 
@@ -189,34 +157,6 @@ def differ(dofs: int, signal: ptr8, knots: int, after_q15: ptr16, before_q15: pt
                     change = int(after_q15[at + b]) - int(before_q15[at + b]) + _DELTA_ZERO
                 delta_q15[at + b] = change
                 b += 1
-        d += 1
-
-
-@micropython.viper
-def shift_levels(
-    dofs: int, signal: ptr8, delta_q15: ptr32, changes_q15: ptr32, present: int, level_q16: ptr32, shifted_q16: ptr32
-):
-    """Write the levels after a change of the future: `G_1 .. G_7` by `change_table`, `G_0` by the change at the knot `present`.
-
-    Bits: shares of one level sum up to 1 in Q15, changes are within 2^15.
-    """
-    d = 0
-    while d < dofs:
-        if signal[d]:
-            at = d << 4
-            shifted_q16[d] = level_q16[d] + ((delta_q15[at + present] - _DELTA_ZERO) << 1)
-            k = 1
-            while k < 8:
-                total = 0
-                place = (k - 1) << 4
-                b = 0
-                reach = 16 if k == 7 else 2 * k + 3
-                while b < reach:
-                    total += (changes_q15[place + b] - _DELTA_ZERO) * (delta_q15[at + b] - _DELTA_ZERO)
-                    b += 1
-                place = (k << 4) + d
-                shifted_q16[place] = level_q16[place] + ((total + 0x2000) >> 14)
-                k += 1
         d += 1
 
 

@@ -107,8 +107,8 @@ def _apply(
 ) -> int:
     """Let all targets stamped `frame` or earlier act; return how many wait: without `consume` all of them, and none is late.
 
-    `counts[0]` counts the late ones, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]` gets a bit
-    per live channel whose target acted.
+    `counts[0]` counts the late ones, up to 2^30 - 1, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]` gets a
+    bit per live channel whose target acted.
     """
     kept = 0
     n = 0
@@ -116,7 +116,7 @@ def _apply(
         if queue_frame[n] <= frame:
             kind = int(queue_kind[n])
             if kind < 128:
-                if queue_frame[n] < frame and consume:
+                if queue_frame[n] < frame and consume and counts[0] < 0x3FFFFFFF:
                     counts[0] = counts[0] + 1
             kind = kind & 127
             index = int(queue_index[n])

@@ -25,9 +25,11 @@ from shared import codec, messages
 from shared.formats import ACTIONS_MAX, DOFS_MAX, KILLED_BY_HOST, LIVES_MAX, MAPPINGS_MAX, QUEUE_MAX
 
 _CHUNK = const(32)  # bytes taken between two looks at the frame clock; one costs up to 50 us on USB
+_TOO_LONG = const(1000)  # more than any packet has, where the length of what never ends stays
 _STALE_US = const(20000)  # a partial packet older than this is dropped
 _HISTORY = const(16)  # answers kept for repeated commands; the host has fewer under way
 _PAYLOAD = const(2)  # place of the payload in a body
+_COUNT_MAX = const(0x3FFFFFFF)  # where counts stay, as a larger one would need memory
 
 _WELCOME_FIELDS = messages.find(messages.WELCOME)[2]
 _WELCOME_FORMAT = messages.struct_format(_WELCOME_FIELDS)
@@ -104,12 +106,14 @@ class Link:
         # Only where the line was seen to be still: the main loop itself may have been away for longer.
         if self._length and self._has_paused and ticks_diff(now_us, self._byte_us) > _STALE_US:
             self._length = 0
-            self.damaged += 1
+            self._drop()
         self._has_paused = False
         start = 0
         while start < end:
             stop = _collect(chunk, start, end, wire, self._length, codec.WIRE_MAX)
             self._length += stop - start
+            if self._length > _TOO_LONG:
+                self._length = _TOO_LONG
             start = stop + 1
             if stop < end:
                 length = self._length
@@ -135,13 +139,14 @@ class Link:
     def _packet(self, length):
         body = self._wire
         if length > codec.WIRE_MAX:
-            self.damaged += 1
+            self._drop()
             return
         length = codec.decode(body, length)
         if length < 0 or not codec.is_sealed(body, length) or body[0] >= 128:
-            self.damaged += 1
+            self._drop()
             return
-        self.packets += 1
+        if self.packets < _COUNT_MAX:
+            self.packets += 1
         self._puppet.motor.heard()
         message_id = body[0]
         seq = body[1]
@@ -178,6 +183,10 @@ class Link:
             self._answer(seq, self._statuses[seq % _HISTORY], self._details[seq % _HISTORY])
         else:
             self._answer(seq, messages.RESEND, self._expected)
+
+    def _drop(self):
+        if self.damaged < _COUNT_MAX:
+            self.damaged += 1
 
     def _answer(self, seq, status, detail):
         out = self.out

@@ -259,6 +259,30 @@ def _ends(
 
 
 @micropython.viper
+def _gestures(playing: ptr8, found: int, cycles: ptr16, target_q28: ptr32) -> int:
+    """Return how many gestures are under way."""
+    count = 0
+    n = 0
+    while n < found:
+        i = int(playing[n])
+        if cycles[i] and target_q28[i]:
+            count += 1
+        n += 1
+    return count
+
+
+@micropython.viper
+def _end(playing: ptr8, found: int, ends: ptr8, target_q28: ptr32):
+    """Set the targets of those to 0 that end now."""
+    n = 0
+    while n < found:
+        if ends[n] == 0:
+            i = int(playing[n])
+            target_q28[i] = 0
+        n += 1
+
+
+@micropython.viper
 def _turns(
     playing: ptr8,
     found: int,
@@ -385,6 +409,7 @@ class Outlook:
         self._never = bytearray([NEVER] * BLOCK)
         self._strides = bytearray([0] + [knots[b] - knots[b - 1] for b in range(1, len(knots))])
         self._strides_before = bytearray([1]) + self._strides[1:]
+        self._strides_behind = bytearray([0, knots[1] - 1]) + self._strides[2:]
         self._ends = bytearray(ACTIONS_MAX)
         self._target_q28 = words(ACTIONS_MAX)
         self._x_q28 = words(ACTIONS_MAX)
@@ -407,6 +432,7 @@ class Outlook:
         self._hold_x_q28 = words(DOFS_MAX)
         self._hold_w_q28 = words(DOFS_MAX)
         self._wanted = bytearray(DOFS_MAX)
+        self._power_q15 = halves(BLOCK)
         self._tempo_q16 = words(ACTIONS_MAX)
         self._master_tempo_q16 = 0
         self._has_gestures = False
@@ -439,14 +465,7 @@ class Outlook:
         _copy_words(x_q28, self._hold_x_q28, tables.dofs)
         _copy_words(w_q28, self._hold_w_q28, tables.dofs)
         _copy_halves(puppet.hold_q15, self.hold_q15, tables.dofs)
-        self._has_gestures = self._find_gestures(tables)
-
-    def _find_gestures(self, tables):
-        for n in range(self.found):
-            i = self.playing[n]
-            if tables.cycles[i] and self._target_q28[i]:
-                return True
-        return False
+        self._has_gestures = _gestures(self.playing, self.found, tables.cycles, self._target_q28) != 0
 
     def write(self, tables, frames, base_q15):
         """Write the next frames down, up to 16, and be behind them; return how many there were: gestures end between blocks.
@@ -507,9 +526,7 @@ class Outlook:
 
     def _end_gestures(self, tables, base_q15):
         """Let gestures end in the first frame of the block, and HOLD have what that leaves."""
-        for n in range(self.found):
-            if self._ends[n] == 0:
-                self._target_q28[self.playing[n]] = 0
+        _end(self.playing, self.found, self._ends, self._target_q28)
         # fmt: off
         compositor.hold_targets(
             tables.actions, self._target_q28, tables.first_mapping, tables.mapping_count, tables.mapped_dof,
@@ -517,30 +534,30 @@ class Outlook:
             self._wanted,
         )
         # fmt: on
-        self._has_gestures = self._find_gestures(tables)
+        self._has_gestures = _gestures(self.playing, self.found, tables.cycles, self._target_q28) != 0
 
-    def sketch(self, tables, puppet, before, knots):
-        """Write the first `knots` knots down, as they are to be expected from the puppet's state in the frame under way.
+    def sketch(self, tables, puppet, is_behind, knots):
+        """Write the first `knots` knots down, as they are to be expected from the puppet's state between two frames.
 
-        With `before` that is the state before this frame's step, else the one behind it. What `take` took is no longer whole
-        then: `playing`, `found` and `hold_q15` are the present ones.
+        The first knot is the frame that comes next, or with `is_behind` the one that has just been, which is left to the caller. What `take`
+        took is no longer whole then: `playing`, `found` and `hold_q15` are the present ones.
         """
         a = puppet.actions
         self.found = a.found
         _copy_bytes(a.playing, self.playing, a.found)
         _copy_halves(puppet.hold_q15, self.hold_q15, tables.dofs)
         rate_hz = tables.frame_rate_hz
-        strides = self._strides_before if before else self._strides
+        strides = self._strides if is_behind else self._strides_before
         live_target_q28, live_x_q28, live_w_q28 = puppet.live_state
         hold_target_q28, hold_x_q28, hold_w_q28 = puppet.hold_state
         # fmt: off
         a.nominal_phases(puppet.master, rate_hz, self._zero_offset_q28, self._nominal_cycle, self._nominal_q24)
         _sketch_phases(
-            a.playing, a.found, knots, self._strides, rate_hz, puppet.tempo_q16[0], a.tempo_q16, tables.warp_q26,
+            a.playing, a.found, knots, self._strides_behind if is_behind else self._strides, rate_hz, puppet.tempo_q16[0], a.tempo_q16, tables.warp_q26,
             self._nominal_cycle, self._nominal_q24, a.offset_q28, self.cycle_course, self.fraction_course_q24, self.pace_q22,
         )
         _ends(
-            a.playing, a.found, knots, 1 if before else 0, 0 if before else 1, tables.cycles, a.target_q28, a.start_q18,
+            a.playing, a.found, knots, 0 if is_behind else 1, 1 if is_behind else 0, tables.cycles, a.target_q28, a.start_q18,
             self.cycle_course, self.fraction_course_q24, self.knots, self._ends,
         )
         _turns(
@@ -548,16 +565,16 @@ class Outlook:
             self._ends, tables.dofs, hold_target_q28, self.turn,
         )
         weights.sketch(
-            a.playing, a.found, knots, strides, self._ends, 0, a.target_q28, a.x_q28, a.w_q28, tables.rise_q26,
+            a.playing, a.found, knots, strides, self._ends, 0, self._power_q15, a.target_q28, a.x_q28, a.w_q28, tables.rise_q26,
             tables.fall_q26, self.weight_course_q28, self.weight_peak_q28,
         )
         weights.sketch(
-            self._all, tables.dofs, knots, strides, self.turn, 8192, hold_target_q28, hold_x_q28, hold_w_q28,
+            self._all, tables.dofs, knots, strides, self.turn, 8192, self._power_q15, hold_target_q28, hold_x_q28, hold_w_q28,
             tables.hold_q26, tables.hold_q26, self.hold_course_q28, self.hold_peak_q28,
         )
         if tables.lives:
             weights.sketch(
-                self._all, tables.lives, knots, strides, self._never, 0, live_target_q28, live_x_q28, live_w_q28,
+                self._all, tables.lives, knots, strides, self._never, 0, self._power_q15, live_target_q28, live_x_q28, live_w_q28,
                 tables.live_rise_q26, tables.live_fall_q26, self.live_course_q28, self._live_peak_q28,
             )
             _drift(

@@ -114,7 +114,7 @@ class Puppet:
         self.clock.hold(self.tables.frame_rate_hz)
         self._synthesise(True)
         self._turn()
-        self.future.start(self.tables, self)
+        self.future.start(self.tables, self, self.base_q15)
         self._rest()
         self.frame = 0
         self.frame_max_us = self.clipped = 0
@@ -198,7 +198,7 @@ class Puppet:
                 return False
             self.future.correct_start(self.tables)
             return True
-        return self.future.is_sketched or self.cues.has_news(self.frame) or self.kalman.is_moving(self.tables.lives)
+        return self.future.has_news() or self.cues.has_news(self.frame) or self.kalman.is_moving(self.tables.lives)
 
     # fmt: off
     def _synthesise(self, is_rehearsal):
@@ -211,7 +211,6 @@ class Puppet:
         self._tempos_changed = 0
         has_news = not is_rehearsal and self._has_news()
         if has_news:
-            a.compute_phases(t, self.master, rate_hz)
             self.future.before_news(t, self)
         self.cues.apply(
             self.frame, a.target_q28, self.live_target_q28, self.tempo_q16, a.wanted_tempo_q16,
@@ -253,12 +252,9 @@ class Puppet:
             self._weight_sum, self._shift, self._upper, self._lower,
         )
         if is_rehearsal:
-            self.future.rehearse(t, self, self.base_q15)
             return
-        if has_news:
-            self.future.after_news(t, self, self.base_q15)
         if self.processing.glide():
-            self.clipped += self.processing.process(t, self.base_q15, self.future, self.frame, self.signal_q15)
+            self.clipped += self.processing.process(t, self.base_q15, self.future.level_q16, self.signal_q15)
         else:
             self.processing.bypass(t, self.base_q15, self.signal_q15)
     # fmt: on

@@ -19,7 +19,6 @@ ZERO_Q20 = 1 << 28  # what is added to signed words, as a 64-bit port reads word
 
 _DOFS = const(16)
 _ZERO = const(0x10000000)
-_LEVEL_ZERO = const(0x100000)
 _GAIN_MS = const(250)  # time constant of the gains
 _OFFSET_MS = const(150)  # of the offset
 
@@ -74,8 +73,6 @@ def _finish(
     signal: ptr8,
     base_q15: ptr16,
     corr_q20: ptr32,
-    foreseen_q20: ptr32,
-    changed: int,
     offset_q20: ptr32,
     keep_q15: int,
     share_q15: int,
@@ -83,8 +80,8 @@ def _finish(
 ) -> int:
     """Write `clamp(base + corr + e)` of every DOF; return how many were clipped. `offset` holds 2 x 16 words, `e` and `v / F`.
 
-    `share` is `1 / (F tau)`, `keep` is `exp(-share)`. First `e` goes on, then, if `changed` is not 0, the step from `corr` to what it
-    was foreseen to be comes on top. Bits: `e` is within 16, 2^24; limbs of 13 + 12 bits times 15.
+    First `e` goes on: `share` is `1 / (F tau)`, `keep` is `exp(-share)`. Bits: `e` is within 16, 2^24; limbs of 13 + 12 bits
+    times 15.
     """
     clipped = 0
     d = 0
@@ -102,14 +99,8 @@ def _finish(
                 if -32 < off and off < 32 and -32 < rate and rate < 32:
                     off = 0
                     rate = 0
-            if changed:
-                off += foreseen_q20[d] - corr_q20[d]
-                if off > 0xFFFFFF:
-                    off = 0xFFFFFF
-                if off < -0xFFFFFF:
-                    off = -0xFFFFFF
-            offset_q20[d] = off + _ZERO
-            offset_q20[_DOFS + d] = rate + _ZERO
+                offset_q20[d] = off + _ZERO
+                offset_q20[_DOFS + d] = rate + _ZERO
             value += (corr_q20[d] - _ZERO + off + 16) >> 5
             if value < 0:
                 value = 0
@@ -123,6 +114,21 @@ def _finish(
 
 
 @micropython.viper
+def _step(dofs: int, signal: ptr8, before_q20: ptr32, after_q20: ptr32, offset_q20: ptr32):
+    """Add to every `e` what `corr` has lost, within 16."""
+    d = 0
+    while d < dofs:
+        if signal[d]:
+            off = offset_q20[d] - _ZERO + before_q20[d] - after_q20[d]
+            if off > 0xFFFFFF:
+                off = 0xFFFFFF
+            if off < -0xFFFFFF:
+                off = -0xFFFFFF
+            offset_q20[d] = off + _ZERO
+        d += 1
+
+
+@micropython.viper
 def _pass(dofs: int, base_q15: ptr16, offset_q20: ptr32, signal_q15: ptr16):
     """Let the signal be the base, and forget the offsets."""
     d = 0
@@ -133,15 +139,6 @@ def _pass(dofs: int, base_q15: ptr16, offset_q20: ptr32, signal_q15: ptr16):
         d += 1
 
 
-@micropython.viper
-def _set_present(dofs: int, base_q15: ptr16, level_q16: ptr32):
-    """Let `G_0` be the base as it has become."""
-    d = 0
-    while d < dofs:
-        level_q16[d] = (int(base_q15[d]) << 1) + _LEVEL_ZERO
-        d += 1
-
-
 class SignalProcessing:
     """The gains and the offsets. `gain4_q16` are the gains of the last frame, with 4 added; `target4_q16` is set from outside."""
 
@@ -149,7 +146,8 @@ class SignalProcessing:
         self.target4_q16 = words(BANDS)
         self.gain4_q16 = words(BANDS)
         self._corr_q20 = words(DOFS_MAX)
-        self._foreseen_q20 = words(DOFS_MAX)
+        self._after_q20 = words(DOFS_MAX)
+        self._is_active = False
         self._offset_q20 = words(2 * DOFS_MAX)
         self._alpha_q15 = self._keep_q15 = self._share_q15 = 0
 
@@ -161,6 +159,7 @@ class SignalProcessing:
 
     def rest(self):
         """Set what holds before frame 0: all gains 1, no offsets."""
+        self._is_active = False
         for band in range(BANDS):
             self.target4_q16[band] = self.gain4_q16[band] = GAIN4_ONE
         for place in range(2 * DOFS_MAX):
@@ -175,24 +174,28 @@ class SignalProcessing:
         """Move the gains by one frame; return whether any of them is not 1."""
         return _glide(BANDS, self.target4_q16, self.gain4_q16, self._alpha_q15, GAIN4_ONE) != 0
 
-    def process(self, tables, base_q15, future, frame, signal_q15):
-        """Compute the signal of a frame from its base and its bands; return how many values were clipped."""
+    def process(self, tables, base_q15, level_q16, signal_q15):
+        """Compute the signal of a frame from its base, and from its levels as they were foreseen; return how many were clipped.
+
+        If something has arrived, the levels are others, but `e` takes up the difference: the signal of this frame is the same.
+        `follow` is called when they are known.
+        """
+        self._is_active = True
         # fmt: off
-        _set_present(tables.dofs, base_q15, future.level_q16)
-        _correct(
-            tables.dofs, tables.signal, future.level_q16, self.gain4_q16, GAIN4_ONE, self._corr_q20
-        )
-        changed = 1 if future.changed and frame else 0
-        if changed:
-            _correct(
-                tables.dofs, tables.signal, future.foreseen_q16, self.gain4_q16, GAIN4_ONE, self._foreseen_q20
-            )
+        _correct(tables.dofs, tables.signal, level_q16, self.gain4_q16, GAIN4_ONE, self._corr_q20)
         return _finish(
-            tables.dofs, tables.signal, base_q15, self._corr_q20, self._foreseen_q20, changed, self._offset_q20,
-            self._keep_q15, self._share_q15, signal_q15,
+            tables.dofs, tables.signal, base_q15, self._corr_q20, self._offset_q20, self._keep_q15, self._share_q15,
+            signal_q15,
         )
         # fmt: on
 
     def bypass(self, tables, base_q15, signal_q15):
         """Let the signal be the base, as it is with all gains 1."""
+        self._is_active = False
         _pass(tables.dofs, base_q15, self._offset_q20, signal_q15)
+
+    def follow(self, tables, level_q16):
+        """Let the offsets take up what the levels of the last frame have become, from what `process` took them for."""
+        if self._is_active:
+            _correct(tables.dofs, tables.signal, level_q16, self.gain4_q16, GAIN4_ONE, self._after_q20)
+            _step(tables.dofs, tables.signal, self._corr_q20, self._after_q20, self._offset_q20)

@@ -129,6 +129,7 @@ def sketch(
     strides: ptr8,
     turn: ptr8,
     turned_q13: int,
+    power_q15: ptr16,
     target_q28: ptr32,
     x_q28: ptr32,
     w_q28: ptr32,
@@ -141,8 +142,10 @@ def sketch(
 
     `s` steps of both filters at once, `q = 1 - a`: `x' - g = q^s (x - g)`, `w' - g = q^s ((w - g) + s a (x - g))`. After
     `turn[n]` steps item `n` gets the target `turned`; 255 is never. `course` and `peak` are as in `foresee`; nothing else changes.
+    `power` is scratch: powers that serve items with the same coefficient.
     Bits: differences in Q13 within 2^15, powers in Q15; where a power is not 0, `s * a * power` is below 3/8.
     """
+    cached = 0
     n = 0
     while n < found:
         i = int(items[n])
@@ -157,10 +160,44 @@ def sketch(
         steps = 0
         at = n << 4
         b = 0
-        if x == 0 and w == 0 and turns == 255:
-            peak = g
+        if turns == 255:
+            if x == 0 and w == 0:
+                peak = g
+                while b < knots:
+                    course_q28[at + b] = g << 15
+                    b += 1
+            elif a != cached:
+                cached = a
+                while b < knots:
+                    part = int(strides[b])
+                    if part != known:
+                        known = part
+                        power = 32768
+                        square = (0x4000000 - a + 0x400) >> 11
+                        k = part
+                        while k:
+                            if k & 1:
+                                power = (power * square + 0x4000) >> 15
+                            square = (square * square + 0x4000) >> 15
+                            k = k >> 1
+                    power_q15[b] = power
+                    b += 1
+                b = 0
             while b < knots:
-                course_q28[at + b] = g << 15
+                part = int(strides[b])
+                power = int(power_q15[b])
+                if power:
+                    w = ((w + ((((part * (a >> 11)) >> 6) * x) >> 9)) * power + 0x4000) >> 15
+                    x = (x * power + 0x4000) >> 15
+                else:
+                    x = 0
+                    w = 0
+                k = g + w
+                if k < 0:
+                    k = 0
+                if k > peak:
+                    peak = k
+                course_q28[at + b] = k << 15
                 b += 1
         while b < knots:
             stride = int(strides[b])

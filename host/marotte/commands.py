@@ -18,10 +18,12 @@ from rich.table import Table
 
 from marotte import ports
 from marotte.calibration import Calibration, CalibrationError
+from marotte.capture import STANDARD_INPUT, CapturingCarrier, read_capture
 from marotte.emulated import connected, open_mcu, without_feedback
 from marotte.errors import MarotteError
 from marotte.files import Files, Watch
 from marotte.link import Carrier, LinkError, VirtualCarrier
+from marotte.link_tools import dump, replay, stats, stats_text
 from marotte.outputs import Output
 from marotte.ports import SerialCarrier
 from marotte.pulses import PulseSummary, measure
@@ -105,11 +107,15 @@ class RunOptions:
     seconds: Fraction | None = None
     no_view: bool = False
     watch: Watch | None = None
+    capture: Path | None = None
+    """The file that what goes over the link is written to."""
 
 
 def run_on_port(files: Files, port: str, options: RunOptions, console: Console) -> bool:
     """Play live on a port; return whether the user ended it. Raises MarotteError."""
-    carrier = SerialCarrier(port)
+    if options.capture:
+        _require_writable(options.capture)
+    carrier = _captured(SerialCarrier(port), options.capture)
     try:
         return _perform(files, carrier, port, options, console)
     finally:
@@ -120,6 +126,8 @@ def run_on_mcu(files: Files, mcu: str, options: RunOptions, console: Console) ->
     """Play live on an emulated MCU and show the pulses of its pins; return whether the user ended it. Raises MarotteError."""
     from marotte.mcu.serve import serve
 
+    if options.capture:
+        _require_writable(options.capture)
     with contextlib.ExitStack() as stack:
         virtual = stack.enter_context(open_mcu(mcu))
         if files.robot:
@@ -127,7 +135,7 @@ def run_on_mcu(files: Files, mcu: str, options: RunOptions, console: Console) ->
         if options.watch:
             options.watch.adapt = without_feedback
         live = stack.enter_context(serve(virtual))
-        carrier = SerialCarrier(live.url)
+        carrier = _captured(SerialCarrier(live.url), options.capture)
         try:
             interrupted = _perform(files, carrier, f"emulated {mcu} at {live.url}", options, console)
         finally:
@@ -271,7 +279,39 @@ def list_ports() -> None:
         print("no serial port found (is the robot plugged in?)")
 
 
-def _perform(files: Files, carrier: SerialCarrier, where: str, options: RunOptions, console: Console) -> bool:
+def dump_capture(path: str) -> None:
+    """Print the packets of a capture. Raises MarotteError."""
+    for line in dump(read_capture(path)):
+        print(line, flush=path == STANDARD_INPUT)
+
+
+def replay_capture(path: str, where: Where, robot: Robot | None) -> bool:
+    """Send the host's half of a capture to an MCU, print and return whether it did as in the capture. Raises MarotteError."""
+    records = list(read_capture(path))
+    with _carrier(where) as (carrier, name):
+        if robot and isinstance(carrier, VirtualCarrier):
+            connected(carrier.mcu, robot)
+        result = replay(records, carrier)
+    for difference in result.differences:
+        print(difference)
+    how = "as" if result.agrees else "not as"
+    print(
+        f"{name} did {how} in the capture: {result.packets} packets sent, {result.answers} commands answered alike, "
+        f"{result.frames} frames alike"
+    )
+    return result.agrees
+
+
+def print_stats(path: str, baud: int) -> None:
+    """Print the figures of a capture. Raises MarotteError."""
+    print(stats_text(stats(read_capture(path)), baud))
+
+
+def _captured(carrier: Carrier, path: Path | None) -> Carrier:
+    return CapturingCarrier(carrier, path) if path else carrier
+
+
+def _perform(files: Files, carrier: Carrier, where: str, options: RunOptions, console: Console) -> bool:
     from marotte.run import default_seconds, perform
 
     arm, seconds = options.arm, options.seconds

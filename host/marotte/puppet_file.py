@@ -71,13 +71,13 @@ def load_puppet(path: str | Path) -> Puppet:
 def read_puppet(path: str | Path) -> tuple[Puppet, list[Mistake]]:
     """Return what could be read of a puppet, and every mistake in its file."""
     document = Document(path)
-    puppet = _Reader(document).puppet() if document.is_parsed else Puppet(Path(path).stem)
+    puppet = document.read_until_full(lambda: _Reader(document).puppet(), Puppet(Path(path).stem))
     return puppet, document.in_order()
 
 
 def weights(table: Table, actions: Iterable[str]) -> dict[str, float]:
     """Return the weight targets of a table whose keys are actions."""
-    known = list(actions)
+    known = dict.fromkeys(actions)
     targets = {}
     for name in table.names():
         if name not in known:

@@ -136,14 +136,17 @@ def load_score(path: str | Path, puppet: Puppet) -> Score:
 def read_score(path: str | Path, puppet: Puppet) -> tuple[Score, list[Mistake]]:
     """Return what could be read of a score, and every mistake in its file."""
     document = Document(path)
-    cues: list[Cue] = []
-    if document.is_parsed:
-        root = document.root()
-        cues = [_cue(table, puppet) for table in root.list_of_tables("cue")]
-        if not cues and document.is_parsed:
-            root.mistake("has no cue, expected at least one [[cue]]")
-        root.finish()
-    return Score(tuple(cues)), document.in_order()
+    score = document.read_until_full(lambda: _score(document, puppet), Score())
+    return score, document.in_order()
+
+
+def _score(document: Document, puppet: Puppet) -> Score:
+    root = document.root()
+    cues = [_cue(table, puppet) for table in root.list_of_tables("cue")]
+    if not cues and document.is_parsed:
+        root.mistake("has no cue, expected at least one [[cue]]")
+    root.finish()
+    return Score(tuple(cues))
 
 
 def _cue(table: Table, puppet: Puppet) -> Cue:

@@ -40,6 +40,9 @@ GREETING_US = 150_000
 STEP_US = 2_000
 """Longest wait for one look at the carrier while something is expected."""
 
+TAPS_KEPT = 1 << 16
+"""Frames whose taps wait to be taken; of more than that, the oldest are dropped."""
+
 DICTIONARY = codec.crc32(messages.canonical_text().encode())
 
 
@@ -68,15 +71,15 @@ class Session:
     """One host and one MCU. All methods raise LinkError, or what the carrier raises, when the MCU or the port is gone.
 
     `welcome` holds the fields of the MCU's greeting. `taps` collects `(frame, taps, values_q15)` as telemetry brings
-    them: the values of all DOFs, base, signal and motor one after the other as far as `taps` names them. `weights` is
-    `(frame, {action: weight_q12})` of the last weights message, `weights_seen` has the last WEIGHTS_KEPT of them.
+    them, the newest TAPS_KEPT: the values of all DOFs, base, signal and motor one after the other as far as `taps` names them.
+    `weights` is `(frame, {action: weight_q12})` of the last weights message, `weights_seen` has the last WEIGHTS_KEPT of them.
     """
 
     def __init__(self, carrier: Carrier):
         self.carrier = carrier
         self.link = Link(carrier, self._on_message)
         self.welcome: dict[str, int] = {}
-        self.taps: deque[tuple[int, int, list[int]]] = deque()
+        self.taps: deque[tuple[int, int, list[int]]] = deque(maxlen=TAPS_KEPT)
         self.weights: tuple[int, dict[int, int]] = (-1, {})
         self.weights_seen: deque[tuple[int, dict[int, int]]] = deque(maxlen=WEIGHTS_KEPT)
         self._tables: Tables | None = None

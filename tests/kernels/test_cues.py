@@ -154,6 +154,13 @@ def test_targets_act_in_their_frame_in_order_and_the_rest_waits(targets, frame, 
     assert list(counts) == [before[0] + late, before[1] + changes, news, streamed]
 
 
+def test_count_of_late_targets_stays_where_it_needs_no_memory():
+    counts = words([(1 << 30) - 2, 0])
+    queue = Queue([Target(5, MODULE.WEIGHT, 0, 0)] * 3)
+    assert MODULE._apply(6, 3, *queue.arrays, words([0]), words([0]), words([0]), words([0]), counts) == 0
+    assert counts[0] == (1 << 30) - 1
+
+
 @pytest.mark.parametrize(("frame", "acts"), [(99, False), (100, True), (101, True)])
 def test_target_acts_from_its_frame_on(frame, acts):
     queue = Queue([Target(100, MODULE.WEIGHT, 2, 77)])

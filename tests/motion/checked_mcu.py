@@ -50,12 +50,13 @@ SMALL_INT_FUNCTIONS = (
     *methods("BridgeDriver", "attach", "release", "write", "_write", "quiet"),
     *methods("Pca9685Driver", "attach", "release", "flush", "attend", "quiet", "_enable", "_switch", "_wanted"),
     *methods("_Chip", "attach", "release", "quiet", "flush", "attend", "_set_up", "gone", "_transfer"),
-    *methods("Link", "poll", "report", "send", "_packet", "_answer"),
-    *methods("Commands", "carry_out", "_queue"),
+    *methods("Link", "poll", "report", "send", "_packet", "_answer", "_drop"),
+    *methods("Commands", "carry_out", "_queue", "_refuse"),
     *methods(
         "Commands", "_on_weight_targets", "_on_live_targets", "_on_tempo", "_on_telemetry", "_on_start", "_on_stop", "_on_ping",
-        "_on_arm", "_on_kill",
+        "_on_arm", "_on_kill", "_on_hello", "_on_calibrate", "_on_limit",
     ),
+    "_half", "_word", *methods("Tables", "bad_limit", "_bad_limit", "limit", "bad_calibration", "_bad_calibration", "calibrate"),
     *methods("Telemetry", "report", "_report_taps", "_send_taps", "_pack_frame"),
 )
 """What runs while a puppet plays: a larger integer would allocate on a 32-bit port."""

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 PET = str(ROOT / "puppets" / "pet.toml")
 SCORE = str(ROOT / "puppets" / "pet-score.toml")
 ROBOT = str(ROOT / "puppets" / "pet-robot.toml")
-COMMANDS = ("check", "render", "plot", "run", "save", "calibrate", "ports", "mcu")
+COMMANDS = ("check", "render", "plot", "run", "save", "calibrate", "ports", "mcu", "link")
 
 
 @pytest.fixture
