@@ -1,5 +1,7 @@
 """Tables from the wire are not trusted: whatever comes in whatever order, it is stored within the arrays or refused."""
 
+from array import array
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -362,3 +364,11 @@ def test_curves_and_programs_fill_their_pools_and_no_more():
         assert tables.program(number, program.WORDS_MAX) is None
         assert [tables.word(word) for word in words] == [None] * program.WORDS_MAX
     assert (tables.program(programs, 2), tables.word(0)) == (1, 0)
+
+
+def test_arrays_begin_with_zeros_and_no_more_is_cleared():
+    words, halves = array("i", [-1] * 5), array("H", [65535] * 5)
+    MODULE._clear_words(words, 4)
+    MODULE._clear_halves(halves, 4)
+    assert (list(words), list(halves)) == ([0, 0, 0, 0, -1], [0, 0, 0, 0, 65535])
+    assert (MODULE.words(300), MODULE.halves(300)) == (array("i", [0] * 300), array("H", [0] * 300))

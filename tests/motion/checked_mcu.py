@@ -29,7 +29,15 @@ SMALL_INT_FUNCTIONS = (
         "Actions", "compute_phases", "follow_tempos", "end_gestures", "enter", "warp", "_phases", "_nominal", "_place"
     ),
     *methods("Blinks", "enter", "evaluate", "exchange"),
-    *methods("Programs", "evaluate"),
+    *methods("Programs", "evaluate", "add"),
+    *methods("Kalman", "step", "is_moving"),
+    *methods("SignalProcessing", "glide", "process", "bypass", "follow"),
+    *methods("Outlook", "take", "write", "sketch", "_advance_phases", "_first_end", "_end_gestures"),
+    *methods("Foresight", "evaluate"),
+    *methods(
+        "Future", "has_news", "before_news", "advance", "work", "_sketch_before", "_sketch", "_recall", "_levels", "_begin",
+        "_differ", "_bend_some", "_smooth_some", "_weigh", "_left_us", "_portion", "_fill", "_compute",
+    ),
     *methods("Exchange", "carry_over", "_swap"),
     *methods("Puppet", "start", "stop", "prepare", "step", "_synthesise", "_rest"),
     *methods(
