@@ -36,8 +36,10 @@ _FAR = const(271)
 _BEND_DOFS = const(6)  # that one portion bends
 
 # What work costs on an RP2040 at 125 MHz, in microseconds, a little more than was measured (`make bench`).
-_PERIOD_PERCENT = const(88)  # of a period; the rest is for motor ticks and the link
-_FIXED_US = const(2300)  # the frame under way, its bands
+_LINK_PERCENT = const(10)  # of a period
+_TICK_US = const(250)  # a motor tick
+_TICK_DOF_US = const(75)
+_FIXED_US = const(2800)  # the frame under way, its bands
 _FIXED_DOF_US = const(60)
 _FIXED_ACTION_US = const(10)
 _FIXED_MAPPING_US = const(9)
@@ -45,17 +47,19 @@ _NEWS_US = const(900)  # to begin anew
 _NEWS_DOF_US = const(230)
 _SKETCH_US = const(1000)  # one sketch
 _SKETCH_DOF_US = const(20)
-_SKETCH_ACTION_US = const(60)
+_SKETCH_ACTION_US = const(180)
 _SKETCH_MAPPING_US = const(25)
 _SKETCH_WORD_US = const(16)
-_FRAME_US = const(60)  # one frame to come
-_FRAME_DOF_NS = const(8500)
-_FRAME_ACTION_NS = const(6500)
-_FRAME_MAPPING_NS = const(1300)
+_BLOCK_US = const(500)  # a block of frames to come
+_BLOCK_MAPPING_US = const(5)
+_FRAME_NS = const(25000)  # a frame in it
+_FRAME_DOF_NS = const(8000)
+_FRAME_ACTION_NS = const(12000)
+_FRAME_MAPPING_NS = const(700)
 _FRAME_WORD_NS = const(1000)
-_FRAME_LIVE_NS = const(4500)
-_BURST_US = const(5000)  # by which news may delay the next frame, if there was none in the frame before
-_SLICE_US = const(5000)  # that one portion may take
+_FRAME_LIVE_NS = const(6000)
+_BURST_US = const(1000)  # by which news may delay the next frame, if there was none in the frame before
+_SLICE_US = const(6000)  # that one portion may take
 _START_US = const(160000)  # for the future of frame 0
 
 _BEGIN = const(0)  # stages of work
@@ -178,6 +182,7 @@ class Future:
         self._is_sketched = False
         self._is_sketchy = True  # whether there is time for sketches
         self._fixed_us = self._sketch_us = self._frame_us = 1
+        self._block = BLOCK  # frames that are computed at once
 
     # --- in a frame
 
@@ -196,8 +201,7 @@ class Future:
         a = puppet.actions
         a.compute_phases(tables, puppet.master, tables.frame_rate_hz)  # which lists who plays
         self._weigh(tables, a.playing, a.found)
-        need_us = _NEWS_US + _NEWS_DOF_US * tables.dofs + 2 * self._sketch_us
-        self._is_sketchy = need_us < self._left_us(tables)
+        self._is_sketchy = self._can_sketch(tables, self._left_us(tables))
         if self._is_sketchy:
             self._sketch(tables, puppet, False)
             _copy_halves(self._foresight.future_q15, self._before_q15, tables.dofs * BLOCK)
@@ -293,8 +297,10 @@ class Future:
             self._front = self._frame
             self._has_changed = True
         us = self._left_us(tables)
+        if self._can_sketch(tables, us):
+            us -= self._sketch_us  # of what is there before the next news
         if self._stage == _BEND:
-            us -= _NEWS_US + _NEWS_DOF_US * tables.dofs + 2 * self._sketch_us
+            us -= _NEWS_US + _NEWS_DOF_US * tables.dofs + self._sketch_us
         self._quota = self._portion(us)
         self._had_news = self._has_changed
 
@@ -344,12 +350,21 @@ class Future:
         self._fixed_us = _FIXED_US + _FIXED_DOF_US * t.dofs + _FIXED_ACTION_US * found + _FIXED_MAPPING_US * mappings
         self._sketch_us = _SKETCH_US + _SKETCH_DOF_US * t.dofs + _SKETCH_ACTION_US * found
         self._sketch_us += _SKETCH_MAPPING_US * mappings + _SKETCH_WORD_US * words
-        frame_ns = _FRAME_DOF_NS * t.dofs + _FRAME_ACTION_NS * found + _FRAME_MAPPING_NS * mappings
-        self._frame_us = _FRAME_US + (frame_ns + _FRAME_WORD_NS * words + _FRAME_LIVE_NS * t.lives) // 1000
+        frame_ns = _FRAME_NS + _FRAME_DOF_NS * t.dofs + _FRAME_ACTION_NS * found + _FRAME_MAPPING_NS * mappings
+        frame_us = (frame_ns + _FRAME_WORD_NS * words + _FRAME_LIVE_NS * t.lives) // 1000
+        block_us = _BLOCK_US + _BLOCK_MAPPING_US * mappings
+        self._block = min(BLOCK, max(1, (_SLICE_US - block_us) // frame_us))
+        self._frame_us = frame_us + block_us // self._block
+
+    def _can_sketch(self, tables, us):
+        """Return whether two sketches fit into a time, and what follows them."""
+        return _NEWS_US + _NEWS_DOF_US * tables.dofs + 2 * self._sketch_us < us
 
     def _left_us(self, tables):
         """Return what is left of a period when the frame has been computed."""
-        left_us = 10000 * _PERIOD_PERCENT // tables.frame_rate_hz - self._fixed_us
+        tick_us = _TICK_US + _TICK_DOF_US * tables.dofs
+        percent = max(20, 100 - _LINK_PERCENT - 100 * tick_us // tables.motor_period_us)
+        left_us = 10000 * percent // tables.frame_rate_hz - self._fixed_us
         return left_us if self._had_news else left_us + _BURST_US
 
     def _portion(self, us):
@@ -367,8 +382,7 @@ class Future:
         """Compute the next block of frames to come."""
         front = self._front
         bands.column(self._base_q15, self._row, tables.dofs, front - 1, self._column_q15)
-        frames = min(BLOCK, self._quota, max(1, _SLICE_US // self._frame_us))
-        frames = self._outlook.write(tables, frames, self._column_q15)
+        frames = self._outlook.write(tables, min(self._block, self._quota), self._column_q15)
         self._foresight.evaluate(tables, self._outlook, frames, 0, puppet)
         # fmt: off
         bands.put_block(
