@@ -39,7 +39,7 @@ BLOCK = 16
 FADE_ERROR = 2.0**-13
 """What is rounded or dropped on the way to the mean and back, eight units of Q16 at most."""
 SINE_ERROR = 2.0**-15
-"""Of a sine from -1 to 1: half a unit of the raised one. The fade's table divides by the angle, so it weighs more the smaller that is."""
+"""Of a sine from -1 to 1: half a unit of the raised one. The table of fades divides it by the angle."""
 
 
 class Stack(list):
