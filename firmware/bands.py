@@ -1,8 +1,8 @@
 """Seven frequency bands: the cascade of Bruderlin and Williams over past and future at once.
 
 `G_0` is the base, `G_{k+1}(n) = sum kernel(m) * G_k(n + m * 2^k)` with the kernel `[1 4 6 4 1] / 16`, m = -2..2; the band `k` is
-`G_k - G_{k+1}`. Frame `n` needs `G_1 .. G_7` at `n` alone. All of them from `G_3` on are symmetric filters of `G_3` at every eighth
-frame, of 5, 13, 29 and 61 taps, so two rings are kept: the base from the past through the present to the future, and its
+`G_k - G_{k+1}`. Frame `n` needs `G_1 .. G_7` at `n` alone. All of them from `G_3` on are symmetric filters of `G_3` at every
+eighth frame, of 5, 13, 29 and 61 taps, so two rings are kept: the base from the past through the present to the future, and its
 `G_3`. That takes 38 products per DOF and frame where a filter of the base takes 255.
 
 Source: SPEC of motion signal processing; Bruderlin and Williams, Motion Signal Processing (1995).
@@ -13,7 +13,7 @@ from array import array
 import micropython
 from micropython import const
 
-from shared.formats import BANDS, DOFS_MAX
+from shared.formats import BANDS
 
 LEVELS = BANDS + 1  # G_0 .. G_7
 REACH = 2 * (2**BANDS - 1)  # frames that the lowest band looks ahead and back
@@ -41,7 +41,7 @@ def _kernels(count):
 
 
 def tap_table():
-    """Return the halves of `c_1 .. c_4` from their middle on, 3 + 7 + 15 + 31 words, scaled by 16, 16^2, 16^3, 16^4. Allocates."""
+    """Return the halves of `c_1 .. c_4` from their middle on, 3 + 7 + 15 + 31 words, times 16, 16^2, 16^3, 16^4. Allocates."""
     table = array("i")
     for kernel in _kernels(4)[1:]:
         for value in kernel[len(kernel) // 2 :]:
@@ -145,7 +145,7 @@ def split(
 
 @micropython.viper
 def differ(dofs: int, signal: ptr8, knots: int, after_q15: ptr16, before_q15: ptr16, delta_q15: ptr32):
-    """Write what has changed at the knots, 16 per DOF, with 2^16 added; beyond the last knot that is known it is what it is there."""
+    """Write what has changed at the knots, 16 per DOF, with 2^16 added; beyond the last known knot it stays."""
     d = 0
     while d < dofs:
         if signal[d]:
@@ -230,7 +230,18 @@ def put_block(base_q15: ptr16, row: ptr8, dofs: int, signal: ptr8, first: int, f
 
 
 @micropython.viper
-def fill(base_q15: ptr16, third_q15: ptr16, row: ptr8, dofs: int, signal: ptr8, first: int, frames: int, value_q15: ptr16, stride: int, at: int):
+def fill(
+    base_q15: ptr16,
+    third_q15: ptr16,
+    row: ptr8,
+    dofs: int,
+    signal: ptr8,
+    first: int,
+    frames: int,
+    value_q15: ptr16,
+    stride: int,
+    at: int,
+):
     """Fill both rings from frame `first` on with one value per DOF, `value[at + stride * dof]`."""
     d = 0
     while d < dofs:

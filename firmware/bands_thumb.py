@@ -1,7 +1,7 @@
 """The loops of `bands` that run often in the RP2040's own instructions: the same to the bit, several times as fast.
 
-`smooth`, `split` and `bend` do what those of `bands` do, which say what has to come out. Each prepares a few words and lets a function without
-variables do the rest; see `foresight_thumb`.
+`smooth`, `split` and `bend` do what those of `bands` do, which say what has to come out. Each prepares a few words and lets a
+function without variables do the rest; see `foresight_thumb`.
 """
 
 from array import array
@@ -19,7 +19,7 @@ _task = words(12)
 
 
 def quartets(taps):
-    """Return `tap_table` in another order: of `c_1 .. c_4`, four words per place behind their middle, 0 beyond their ends. Allocates."""
+    """Return `tap_table` rearranged, `c_1 .. c_4`, four words a place behind the middle, 0 beyond their ends. Allocates."""
     table = array("i")
     for place in range(1, 31):
         for first, last in ((0, 3), (3, 10), (10, 25), (25, 56)):
@@ -31,7 +31,8 @@ def quartets(taps):
 def _sum_pairs(r0):
     """Add up pairs of a ring, every eighth frame, four times.
 
-    Words: 0 address of a row, 1 place in it in bytes, 2 address of quartets, 3 how many; 4..7 get the sums of tap * (pair - 32768).
+    Words: 0 address of a row, 1 place in it in bytes, 2 address of quartets, 3 how many; 4..7 get the sums of
+    tap * (pair - 32768).
     """
     mov(r4, r8)
     mov(r5, r9)
@@ -108,8 +109,8 @@ def _sum_pairs(r0):
 def _smooth_row(r0):
     """Run the kernel three times over a part of a row, the last time into another row.
 
-    Words: 0 address of the row, 1 place in it in bytes, 2 address of scratch, 3 steps of the first pass, 4 of the second, 5 of the
-    third, 6 address of the other row, 7 place in it in bytes.
+    Words: 0 address of the row, 1 place in it in bytes, 2 address of scratch, 3 steps of the first pass, 4 of the second, 5 of
+    the third, 6 address of the other row, 7 place in it in bytes.
     """
     mov(r4, r8)
     mov(r5, r9)
@@ -231,7 +232,8 @@ def _smooth_row(r0):
 def _bend_row(r0):
     """Add a straight line to a part of two rows, within 0..32768.
 
-    Words: 0 and 1 addresses of the rows, 2 place in both in bytes, 3 how many, 4 the line's beginning, 5 its slope, both with 8 places more.
+    Words: 0 and 1 addresses of the rows, 2 place in both in bytes, 3 how many, 4 the line's beginning, 5 its slope, both with 8
+    places more.
     """
     mov(r4, r8)
     push({r4})

@@ -27,6 +27,7 @@ LIVE = const(1)
 TEMPO = const(2)
 GAIN = const(3)
 MASTER_INDEX = const(255)
+_REFUSED_MAX = const(0x3FFFFF00)  # where that count stays, as a larger one would need memory
 _NOW = const(128)  # added to the kind of a target that acts in the next frame and cannot be late
 
 
@@ -107,8 +108,8 @@ def _apply(
 ) -> int:
     """Let all targets stamped `frame` or earlier act; return how many wait: without `consume` all of them, and none is late.
 
-    `counts[0]` counts the late ones, up to 2^30 - 1, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]` gets a
-    bit per live channel whose target acted.
+    `counts[0]` counts the late ones, up to 2^30 - 1, `counts[1]` the tempos of actions, `counts[2]` all but gains; `counts[3]`
+    gets a bit per live channel whose target acted.
     """
     kept = 0
     n = 0
@@ -204,14 +205,15 @@ class Cues:
 
     `counts[0]` counts targets that came after their frame and acted at once, `counts[1]` tempos of actions that acted.
     `counts[2]` counts the targets of the last frame that change what is to come, that is all but gains; `counts[3]` has a
-    bit per live channel that got a target in it. `arrivals` moves on with every payload that is queued. `detail` explains the last refusal: the number of the bad field, or the
-    free places.
+    bit per live channel that got a target in it. `arrivals` moves on with every payload that is queued. `refused` counts
+    targets that found no place. `detail` explains the last refusal: the number of the bad field, or the free places.
     """
 
     def __init__(self):
         self.count = 0
         self.arrivals = 0
         self.detail = 0
+        self.refused = 0
         self.counts = array("i", (0, 0, 0, 0))
         self._frame = array("i", bytes(4 * QUEUE_MAX))
         self._kind = bytearray(QUEUE_MAX)
@@ -239,6 +241,8 @@ class Cues:
         items = (length - 4) // 5
         if self.count + items > QUEUE_MAX:
             self.detail = QUEUE_MAX - self.count
+            if self.refused < _REFUSED_MAX:
+                self.refused += items
             return messages.FULL
         first = least = 0
         if kind == TEMPO:

@@ -1,8 +1,8 @@
 """Foresight: the base motion of frames to come, computed from an outlook, for the DOFs that signal processing looks at.
 
-It is the functions and the compositor once more, over blocks of up to 16 frames, because what a kernel looks up once then serves 16
-times. Weights have 15 bits here where the compositor has 28; a frame to come may be right to a part in some ten thousand, since
-it counts among 508 others. Blinks do not occur: nobody knows their future, so their DOFs are not processed.
+It is the functions and the compositor once more, over blocks of up to 16 frames, because what a kernel looks up once then
+serves 16 times. Weights have 15 bits here where the compositor has 28; a frame to come may be right to a part in some ten
+thousand, since it counts among 508 others. Blinks do not occur: nobody knows their future, so their DOFs are not processed.
 
 In a sketch, whose frames lie apart, each stands for those around it: there a function counts for less the farther it gets on its
 way from one to the next, by `sinc^2` of the part of a cycle, and what it lacks has its mean.
@@ -257,8 +257,8 @@ def _divide(
 ):
     """Write the quotients of all DOFs' sums, 16 places per DOF; where all weights are 0 HOLD's value.
 
-    `capture[d]` not 255: at the first frame behind that number of frames (`frame_of` counts them) HOLD takes over what the frame before
-    it has, if it was faint there. Bits: sums below 2^30, quotients 15.
+    `capture[d]` not 255: at the first frame behind that number of frames (`frame_of` counts them) HOLD takes over what the
+    frame before it has, if it was faint there. Bits: sums below 2^30, quotients 15.
     """
     d = 0
     while d < dofs:
@@ -287,7 +287,7 @@ def _divide(
 
 
 class Foresight:
-    """Computes the base motion of blocks. `future_q15` has 16 values per DOF, those of the frames that the outlook has written down."""
+    """Computes the base motion of blocks. `future_q15` has 16 values per DOF, the frames that the outlook has written down."""
 
     def __init__(self, sine, knots):
         """`knots` are the frames of a sketch, from the present one on."""
@@ -313,7 +313,7 @@ class Foresight:
         self._never = bytearray([255] * DOFS_MAX)
 
     def evaluate(self, tables, outlook, frames, sketching, puppet):
-        """Compute the base of the frames that `outlook` has written down; `sketching` (0 or 1) tells that they are a sketch's knots."""
+        """Compute the base of the frames that `outlook` has written down; `sketching` (0 or 1) that they are a sketch's."""
         t = tables
         o = outlook
         playing = o.playing

@@ -1,8 +1,8 @@
 """The innermost loops of `foresight` in the RP2040's own instructions: the same sums to the bit, in a seventh of the time.
 
-MicroPython's viper keeps nearly all variables in memory. Of what the motion computes, only the frames to come are so many that this
-matters: a kernel here lists what is to be done for an action, a job per mapping, and one function without variables does it.
-Every other MCU uses `foresight._evaluate`, which says what has to come out.
+MicroPython's viper keeps nearly all variables in memory. Of what the motion computes, only the frames to come are so many that
+this matters: a kernel here lists what is to be done for an action, a job per mapping, and one function without variables does
+it. Every other MCU uses `foresight._evaluate`, which says what has to come out.
 """
 
 import micropython

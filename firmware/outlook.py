@@ -12,7 +12,6 @@ import micropython
 from micropython import const
 
 from firmware import actions, compositor, weights
-from firmware.kalman import ZERO_Q28
 from firmware.tables import halves, words
 from shared.formats import ACTIONS_MAX, DOFS_MAX, LIVES_MAX
 
@@ -67,8 +66,8 @@ def _advance_phases(
 ):
     """Write the phases of the playing actions in the next frames: action `n` of the list in frame `b` to place `16 * n + b`.
 
-    `cycle` and `fraction` hold the phase without its offset; both and the offset move on unless `keep` is 0. A frame adds `r * T /
-    F`: whole cycles, and a rest in Q30, right to 2^-30; over 254 frames that is 2^-22 of a cycle. Offsets shrink as in
+    `cycle` and `fraction` hold the phase without its offset; both and the offset move on unless `keep` is 0. A frame adds
+    `r * T / F`: whole cycles, and a rest in Q30, right to 2^-30; over 254 frames that is 2^-22 of a cycle. Offsets shrink as in
     `actions`. Bits: `r * T` in limbs of 10, below 2^27 and 2^28 + 2^16; fractions below 2^31.
     """
     n = 0
@@ -135,9 +134,9 @@ def _sketch_phases(
 ):
     """Write the phases of the playing actions at the knots, and to `pace` by what part of a cycle a frame moves them on.
 
-    `cycle` and `fraction` hold the phases without offsets. Offsets, here in Q20, shrink by the same amount in every frame as long as that is
-    all they may, then by powers of what a frame leaves of them. Bits: a stride of up to 127 frames times a fraction in Q22 is below
-    2^29; half of what a frame advances is below 2^21, 9 places more make 2^30.
+    `cycle` and `fraction` hold the phases without offsets. Offsets, here in Q20, shrink by the same amount in every frame as
+    long as that is all they may, then by powers of what a frame leaves of them. Bits: a stride of up to 127 frames times a
+    fraction in Q22 is below 2^29; half of what a frame advances is below 2^21, 9 places more make 2^30.
     """
     n = 0
     while n < found:
@@ -331,11 +330,12 @@ def _drift(
     w_q28: ptr32,
     course_q28: ptr32,
 ) -> int:
-    """Let the targets of channels that are known to move go on, and write `w` behind them down as `foresee` does; return how many move.
+    """Let the targets of channels that are known to move go on, and write `w` behind them down as `foresee` does; return how
+    many move.
 
-    Each frame `v = fade * v`, `target += v` within 0..1; `strides[b]` frames lead to the one that is written down. The filters are
-    those of `integrate`, but for coefficients in Q15 and its last 2^-18. Bits: velocities within 1, stored with 1
-    added; products of limbs of 14 + 15 and 15 bits.
+    Each frame `v = fade * v`, `target += v` within 0..1; `strides[b]` frames lead to the one that is written down. The filters
+    are those of `integrate`, but for coefficients in Q15 and its last 2^-18. Bits: velocities within 1, stored with 1 added;
+    products of limbs of 14 + 15 and 15 bits.
     """
     moving = 0
     i = 0
@@ -382,8 +382,8 @@ class Outlook:
     """What is known of the next frames, from `frame` on.
 
     `write` and `sketch` leave behind, for the `found` actions of the list `playing`, `weight_course_q28`, `cycle_course` and
-    `fraction_course_q24` with their peaks, the same of HOLD and live channels, each with 16 places per item. `hold_q15` is the value
-    that HOLD holds, and what `sketch` adds is `pace_q22`, `turn`.
+    `fraction_course_q24` with their peaks, the same of HOLD and live channels, each with 16 places per item. `hold_q15` is the
+    value that HOLD holds, and what `sketch` adds is `pace_q22`, `turn`.
     """
 
     def __init__(self, knots):
@@ -407,9 +407,10 @@ class Outlook:
         self._all = bytearray(range(BLOCK))
         self._one = bytearray([1] * BLOCK)
         self._never = bytearray([NEVER] * BLOCK)
-        self._strides = bytearray([0] + [knots[b] - knots[b - 1] for b in range(1, len(knots))])
-        self._strides_before = bytearray([1]) + self._strides[1:]
-        self._strides_behind = bytearray([0, knots[1] - 1]) + self._strides[2:]
+        strides = [knots[b] - knots[b - 1] for b in range(1, len(knots))]
+        self._strides = bytearray([0] + strides)
+        self._strides_before = bytearray([1] + strides)
+        self._strides_behind = bytearray([0, knots[1] - 1] + strides[1:])
         self._ends = bytearray(ACTIONS_MAX)
         self._target_q28 = words(ACTIONS_MAX)
         self._x_q28 = words(ACTIONS_MAX)
@@ -539,8 +540,8 @@ class Outlook:
     def sketch(self, tables, puppet, is_behind, knots):
         """Write the first `knots` knots down, as they are to be expected from the puppet's state between two frames.
 
-        The first knot is the frame that comes next, or with `is_behind` the one that has just been, which is left to the caller. What `take`
-        took is no longer whole then: `playing`, `found` and `hold_q15` are the present ones.
+        The first knot is the frame that comes next, or with `is_behind` the one that has just been, which is left to the
+        caller. What `take` took is no longer whole then: `playing`, `found` and `hold_q15` are the present ones.
         """
         a = puppet.actions
         self.found = a.found
@@ -553,7 +554,8 @@ class Outlook:
         # fmt: off
         a.nominal_phases(puppet.master, rate_hz, self._zero_offset_q28, self._nominal_cycle, self._nominal_q24)
         _sketch_phases(
-            a.playing, a.found, knots, self._strides_behind if is_behind else self._strides, rate_hz, puppet.tempo_q16[0], a.tempo_q16, tables.warp_q26,
+            a.playing, a.found, knots, self._strides_behind if is_behind else self._strides,
+            rate_hz, puppet.tempo_q16[0], a.tempo_q16, tables.warp_q26,
             self._nominal_cycle, self._nominal_q24, a.offset_q28, self.cycle_course, self.fraction_course_q24, self.pace_q22,
         )
         _ends(

@@ -118,7 +118,7 @@ class Puppet:
         self._rest()
         self.frame = 0
         self.frame_max_us = self.clipped = 0
-        self.cues.counts[0] = 0
+        self.cues.counts[0] = self.cues.refused = 0
         self._rehearsed = self.cues.arrivals
         self._is_starting = True
 
@@ -137,8 +137,9 @@ class Puppet:
     def prepare(self):
         """Take a step of what is to be done between frames; return whether there was one to take.
 
-        That is the future that signal processing wants to know, and then an exchange of tables. The last two steps of that collect what tables leave on the heap, so that it does not fill up in the middle of a frame, and put the
-        new tables into force. They wait until there is time for that.
+        That is the future that signal processing wants to know, and then an exchange of tables. The last two steps of that
+        collect what tables leave on the heap, so that it does not fill up in the middle of a frame, and put the new tables into
+        force. They wait until there is time for that.
         """
         if self.future.pending:
             micropython.heap_lock()  # as in a frame

@@ -65,7 +65,8 @@ def foresee(
     course_q28: ptr32,
     peak_q28: ptr32,
 ):
-    """Move the listed entries on by up to 16 frames and write down every step: `w` of item `n` in frame `b` to `course[16 * n + b]`.
+    """Move the listed entries on by up to 16 frames and write down every step: `w` of item `n` in frame `b` is
+    `course[16 * n + b]`.
 
     Each step is that of `integrate`. `peak[n]` is the greatest `w` on the way.
     """
@@ -141,9 +142,9 @@ def sketch(
     """Write down what `w` of the listed entries will be at a few frames to come, each `strides[b]` frames behind the one before.
 
     `s` steps of both filters at once, `q = 1 - a`: `x' - g = q^s (x - g)`, `w' - g = q^s ((w - g) + s a (x - g))`. After
-    `turn[n]` steps item `n` gets the target `turned`; 255 is never. `course` and `peak` are as in `foresee`; nothing else changes.
-    `power` is scratch: powers that serve items with the same coefficient.
-    Bits: differences in Q13 within 2^15, powers in Q15; where a power is not 0, `s * a * power` is below 3/8.
+    `turn[n]` steps item `n` gets the target `turned`; 255 is never. `course` and `peak` are as in `foresee`; nothing else
+    changes. `power` is scratch: powers that serve items with the same coefficient. Bits: differences in Q13 within 2^15, powers
+    in Q15; where a power is not 0, `s * a * power` is below 3/8.
     """
     cached = 0
     n = 0

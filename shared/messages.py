@@ -256,6 +256,7 @@ MESSAGES = (
             ("packets", "I"),
             ("damaged", "I"),
             ("late_targets", "I"),
+            ("refused_targets", "I"),
             ("heap_free", "I"),
             ("clipped", "I"),
         ),

@@ -20,6 +20,10 @@ from tests.link.stage import Parts, open_session, pet_tables
 PUPPETS = Path(__file__).parents[2] / "puppets"
 RANGES = {"B": (0, 0xFF), "H": (0, 0xFFFF), "I": (0, 0xFFFFFFFF), "i": (-(1 << 31), (1 << 31) - 1)}
 COMMANDS = {message[0]: message for message in messages.MESSAGES if message[1] < 128}
+STAMPED = tuple(name for name, _, fields, _ in COMMANDS.values() if fields == (("frame", "i"),))
+"""The messages of stamped targets."""
+TARGETS = {formats.TEMPO_ONE, formats.WEIGHT_ONE, formats.GAIN4_ONE, 0, formats.GAIN4_MAX}
+"""Targets that are right in some of them."""
 TABLE_PARTS = (
     *("begin", "robot", "device", "dof", "character", "output", "feedback", "guard", "action", "mappings", "live"),
     *("curve", "program", "blink", "keep", "commit"),
@@ -66,6 +70,7 @@ def small_upload():
     }
     robot = {"motor_period_us": 10000, "attach_ms": 0, "kill_pin": formats.NO_PIN, "kill_level": 0, "autostart": 1}
     dof = {"kind": 0, "rest_q15": 9000, "low_q15": 0, "high_q15": 32768, "speed_q24": 1 << 20, "accel_q24": 1 << 19}
+    dof |= {"signal": 1}
     output = {"driver": formats.DRIVER_PINS, "turns": 2, "end0_q4us": 4800, "end1_q4us": 48000}
     output |= {"dead_q15": 0, "top_q15": 32768}
     feedback = {"pin": 28, "at0_q15": 3000, "at1_q15": 29000, "gain_q15": 8000, "integral_q24": 1 << 18}
@@ -73,13 +78,15 @@ def small_upload():
     action = {"action": 0, "tempo_q16": 65536, "rise_q26": 1 << 22, "fall_q26": 1 << 22, "first_mapping": 0}
     action |= {"mappings": 2, "entry": 1, "warp_q26": 1 << 20, "cycles": 1000}
     mapping = {"low_q15": 0, "high_q15": 32768}
+    live = {"live": 0, "rest_q28": 1 << 27, "rise_q26": 1 << 20, "fall_q26": 1 << 20}
+    live |= {"predict": formats.PREDICT_KALMAN, "process_q16": 1 << 16, "noise_q16": 1 << 12, "fade_q15": 30000}
     words = (program.CURVE, 0, 16, 5, program.LIVE, 0, program.NOISE, 3, -40, 200, 9, program.LERP)
     return [
         ("begin", begin, []),
         ("robot", robot, []),
         ("device", {"device": 3, "driver": 1}, [{"setting": value} for value in (4, 5, 0x40, 6, 400, 25000)]),
         ("dof", {"dof": 0} | dof, []),
-        ("dof", {"dof": 1} | dof | {"kind": 1, "accel_q24": 1 << 21}, []),
+        ("dof", {"dof": 1} | dof | {"kind": 1, "accel_q24": 1 << 21, "signal": 0}, []),
         ("character", {"dof": 0} | dict.fromkeys([name for name, _ in COMMANDS["character"][2][1:]], 1 << 22), []),
         ("output", {"dof": 0} | output, [{"setting": 2}]),
         ("output", {"dof": 1} | output | {"driver": 1}, [{"setting": 3}, {"setting": 15}]),
@@ -95,7 +102,7 @@ def small_upload():
                 for dof, function, argument in ((0, 6, 0), (1, 7, 0), (0, 5, 0), (1, 2, 15))
             ],
         ),
-        ("live", {"live": 0, "rest_q28": 1 << 27, "rise_q26": 1 << 20, "fall_q26": 1 << 20}, []),
+        ("live", live, []),
         ("curve", {"curve": 0, "samples": 2}, [{"value_q15": 0}, {"value_q15": 32768}]),
         ("program", {"program": 0, "words": len(words)}, [{"word": word} for word in words]),
         ("blink", {"blink": 0, "threshold_q16": 1 << 15, "gap_q18": 1 << 10}, []),
@@ -246,6 +253,9 @@ class Attack:
             return False
         self.say("telemetry", {"taps": 15, "taps_every": 1, "weights_every": 1})
         self.say("weight_targets", {"frame": -1}, [{"action": action, "target_q28": 4 << 28} for action in range(2)])
+        self.say_gains(-1)
+        for frame, target in ((0, 0), (2, 1), (3, 0)):
+            self.say("live_targets", {"frame": frame}, [{"live": 0, "target_q28": target * formats.WEIGHT_ONE}])
         self.say("arm")
         self.say("start")
         self.wait(6 * FRAME_US)
@@ -259,6 +269,8 @@ class Attack:
             weights = (formats.WEIGHT_ONE, formats.WEIGHT_MAX, 1, 0)
             items = [{"action": action, "target_q28": self.rng.choice(weights)} for action in actions]
             self.say("weight_targets", {"frame": self.rng.choice((-1, 0, 3))}, items)
+        if self.rng.random() < 0.8:
+            self.say_gains(self.rng.choice((-1, 0, 3)))
         if self.rng.random() < 0.8:
             self.say("arm")
         self.say("start")
@@ -283,16 +295,22 @@ class Attack:
             else:
                 self.wait(self.rng.choice((3_000, FRAME_US, 4 * FRAME_US)))
 
+    def say_gains(self, frame):
+        """Say gains that are right, as far from 1 as may be."""
+        gains = (formats.GAIN4_MAX, 0, formats.GAIN4_ONE)
+        bands = range(formats.BANDS)
+        self.say("gains", {"frame": frame}, [{"band": band, "gain4_q16": self.rng.choice(gains)} for band in bands])
+
     def say_targets(self):
         """Say a message of stamped targets, mostly right."""
-        name = self.rng.choice(("weight_targets", "live_targets", "tempo"))
+        name = self.rng.choice(STAMPED)
         _, _, _, items = COMMANDS[name]
         frame = self.rng.choice((-1, self._newest + 2, self._newest - 5, any_number(self.rng, "i")))
         count = self.rng.choice((1, 2, 20))
         values = [{field: any_number(self.rng, kind) for field, kind in items} for _ in range(count)]
         for value in values:
-            value[items[0][0]] = self.rng.choice((0, 1, 9, 15, 63, 64, 255))
-            value[items[1][0]] = self.rng.choice((formats.TEMPO_ONE, formats.WEIGHT_ONE, value[items[1][0]]))
+            value[items[0][0]] = self.rng.choice((0, 1, 6, 7, 9, 15, 63, 64, 255))
+            value[items[1][0]] = self.rng.choice((*sorted(TARGETS), value[items[1][0]]))
         self.say(name, {"frame": frame}, values)
 
     def save(self):

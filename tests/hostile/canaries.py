@@ -12,23 +12,29 @@ import gc
 import sys
 from array import array
 
-PATTERN = {"B": b"\xa5", "H": b"\xc3\xa5", "i": b"\xa5\xc3\xa5\x25"}
+PATTERN = {"B": 0xA5, "H": 0xA5C3, "i": 0x25A5C3A5}
+COLLECTED = 64
+"""Elements of an array for which an RP2040 tidies its heap up."""
 plain_bytearray = bytearray
-guarded = []  # (kind, array, width of a canary), in the order of their making
+guarded = {kind: [] for kind in PATTERN}
+"""All arrays of each kind with their canaries, in the order of their making."""
 
 
 def between_canaries(kind, data, width):
-    """Return a view of an array of `kind` with the bytes of `data` in it, and `width` elements of the pattern on both sides."""
-    if sys.platform == "rp2":
+    """Return a view of an array of `kind` with the numbers of `data`, and `width` elements of the pattern on both sides."""
+    count = len(data)
+    if sys.platform == "rp2" and count >= COLLECTED:
         gc.collect()  # it has little more room than it needs
-    ends = PATTERN[kind] * width
-    raw = plain_bytearray(len(data) + 2 * len(ends))
-    raw[: len(ends)] = raw[len(ends) + len(data) :] = ends
-    if any(data):
-        raw[len(ends) : len(ends) + len(data)] = data
-    whole = array(kind, raw)
-    guarded.append((kind, whole, width))
-    return memoryview(whole)[width : len(whole) - width]
+    if isinstance(data, range):
+        whole = array(kind, range(data[0] - width, data[0] + count + width))  # without anything else of that size
+    else:
+        whole = array(kind, range(count + 2 * width))
+        for place in range(count):
+            whole[width + place] = data[place]
+    for place in range(width):
+        whole[place] = whole[width + count + place] = PATTERN[kind]
+    guarded[kind].append(whole)
+    return memoryview(whole)[width : width + count]
 
 
 class _Module:
@@ -39,8 +45,10 @@ def install(width):
     """Let all that is imported from now on have its arrays between canaries; the firmware is imported anew."""
     module = _Module()
 
-    def array_between(kind, data):
-        return between_canaries(kind, data if isinstance(data, bytes) else bytes(array(kind, data)), width)
+    def array_between(kind, data=()):
+        if not data:
+            return array(kind)  # one that grows: no view can do that
+        return between_canaries(kind, data if isinstance(data, range) else array(kind, data), width)
 
     def bytes_between(*data):
         plain = bytes(*data)
@@ -61,16 +69,16 @@ def uninstall():
     builtins.bytearray = plain_bytearray
 
 
-def report():
+def report(width):
     """Print how many arrays there are, and every one whose canaries have changed: its number, kind, length and what is wrong."""
-    print("arrays", len(guarded))
-    for number, (kind, whole, width) in enumerate(guarded):
-        pattern = array(kind, PATTERN[kind])[0]
-        count = len(whole) - 2 * width
-        ends = list(range(-width, 0)) + list(range(count, count + width))
-        bad = [place for place in ends if whole[width + place] != pattern]
-        if bad:
-            print("broken", number, kind, count, bad[:8])
+    print("arrays", sum(len(arrays) for arrays in guarded.values()))
+    for kind, arrays in guarded.items():
+        for number, whole in enumerate(arrays):
+            count = len(whole) - 2 * width
+            ends = list(range(-width, 0)) + list(range(count, count + width))
+            bad = [place for place in ends if whole[width + place] != PATTERN[kind]]
+            if bad:
+                print("broken", number, kind, count, bad[:8])
     print("end of report")
 
 
@@ -90,18 +98,19 @@ def perform_on_pc(width, fault):
     board = Board(open(commands, "rb"), open(records, "wb"), kept, int(resets))  # noqa: PTH123, SIM115
     while True:
         perform(board)
-        report()
+        report(width)
 
 
-def perform_on_pico(fault):
+def perform_on_pico(width, fault):
     """Perform between canaries, twice, so that what is kept on the flash is played the second time; report, and end."""
     from firmware.board_rp2040 import Board
     from firmware.main import perform
 
     plant(fault)
-    imported = len(guarded)
+    imported = {kind: len(arrays) for kind, arrays in guarded.items()}
     for _ in range(2):
         perform(Board())
-        report()
-        del guarded[imported:]
+        report(width)
+        for kind, arrays in guarded.items():
+            del arrays[imported[kind] :]
     uninstall()

@@ -139,6 +139,63 @@ def test_command_after_a_gap_is_answered_with_the_number_expected(mcu):
     assert told == [((expected + ahead) & 255, messages.RESEND, expected) for ahead in (1, 2, 100, 239)]
 
 
+def hello(seq):
+    return wire_packet(
+        messages.HELLO, seq & 255, pack("hello", {"protocol": messages.PROTOCOL, "dictionary": DICTIONARY})
+    )
+
+
+def test_greeting_that_was_repeated_or_overtaken_on_its_way_begins_no_session(mcu):
+    session = open_session(VirtualCarrier(mcu))
+    greeting = session.link._seq - 1
+    session.weight_targets(1000, {})
+    session.flush()
+    mcu.send(hello(greeting) + hello(greeting - 1) + hello(greeting - 7))
+    session.pump(1_000)
+    session.link.post("ping")
+    session.flush()
+    assert session.link.counters.repeated == 0, "the session goes on with its numbers"
+
+
+def test_greeting_with_the_number_of_the_last_one_begins_a_session_later(mcu):
+    session = open_session(VirtualCarrier(mcu))
+    greeting = session.link._seq - 1
+    session.link.post("ping")
+    session.flush()
+    mcu.run_for(600_000)
+    mcu.send(hello(greeting) + wire_packet(messages.STOP, (greeting + 1) & 255, b""))  # where a ping was before
+    mcu.run_for(10_000)
+    answers = [body for _, body in mcu.receive()]
+    assert acknowledged(answers[0]) == (greeting & 255, messages.OK, 0)
+    assert acknowledged(answers[-1]) == ((greeting + 1) & 255, messages.OK, 0)
+
+
+def test_command_of_another_host_is_not_taken_for_one_that_was_carried_out(mcu):
+    session = open_session(VirtualCarrier(mcu))
+    session.link.post("stop")
+    session.flush()
+    expected = session.link._seq
+    other = wire_packet(messages.WEIGHT_TARGETS, (expected - 1) & 255, pack("weight_targets", {"frame": 9}, []))
+    mcu.send(other)
+    mcu.run_for(10_000)
+    assert [acknowledged(answer) for _, answer in mcu.receive()] == [((expected - 1) & 255, messages.RESEND, expected)]
+
+
+def test_targets_that_find_no_place_are_counted(mcu):
+    session = open_session(VirtualCarrier(mcu))
+    session.upload(pet_tables())
+    session.start()
+    refused = []
+    for number in range(formats.QUEUE_MAX // 10 + 3):
+        session.weight_targets(10_000 + number, dict.fromkeys(range(10), 0), lambda *_: refused.append(10))
+    session.flush()
+    assert sum(refused) == 30
+    assert session.status()["refused_targets"] == 30
+    session.start()
+    session.flush()
+    assert session.status()["refused_targets"] == 0
+
+
 def test_mcu_without_a_session_answers_nothing_but_a_greeting(mcu):
     for message_id in (messages.PING, messages.ARM, messages.START, messages.STATUS_REQUEST):
         mcu.send(wire_packet(message_id, 0, b""))
