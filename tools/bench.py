@@ -11,13 +11,14 @@ on top, most of all for code that runs seldom.
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import tempfile
 from pathlib import Path
 
 from bench_motor import measure_ticks, percentile
 from bench_parts import measure_exchange, measure_functions
-from bench_signal import STAGES, Load, measure_free_heap, measure_loads, measure_parts, perform, title
+from bench_signal import STAGES, Load, measure_free_heap, measure_loads, measure_parts, perform, title, with_figures
 from bench_stage import ACTIONS, DOFS, FRAMES, MAPPINGS, PATIENCE_US, PLAYING, SETUP, Cost, Stage, numbers, play
 
 from marotte.images import rp2040_image
@@ -26,6 +27,8 @@ from marotte.mcu.raw_repl import RawRepl
 from marotte.mcu.rp2040 import Rp2040Mcu
 from marotte.session import DICTIONARY, Session
 from shared import formats, messages
+
+DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "motion.md"
 
 PERFORMANCE_FRAMES = 300
 CHUNK_BYTES = 32
@@ -182,18 +185,23 @@ def print_loads(loads: dict[str, list[Load]]) -> None:
     """Print what frames cost with the future that they have to know."""
     for name, some in loads.items():
         print(
-            f"\n{name}\n{'us: median, max':38}{'frame':>14}{'then':>14}{'both':>14}{'mean':>8}{'longest portion':>17}"
+            f"\n{name}\n{'us: median, max':42}{'frame':>14}{'then':>14}{'both':>14}{'mean':>8}{'longest portion':>17}"
         )
         for load in some:
             times = "".join(
                 f"{cost.median_us:8.0f}{cost.greatest_us:6.0f}" for cost in (load.step, load.work, load.both)
             )
             portion = f"{load.portion_us:17.0f}" if load.portion_us else ""
-            print(f"{load.name:38}{times}{load.mean_us:8.0f}{portion}")
+            print(f"{load.name:42}{times}{load.mean_us:8.0f}{portion}")
 
 
 def main() -> None:
-    """Measure, and print the table."""
+    """Measure, and print the tables."""
+    parser = argparse.ArgumentParser(description="what a frame costs on the emulated RP2040")
+    parser.add_argument(
+        "--docs", action="store_true", help="write the figures of signal processing to docs/motion.md, too"
+    )
+    is_documented = parser.parse_args().docs
     image = rp2040_image()
     with Rp2040Mcu(image.path, timed_flash=False) as mcu:
         repl = RawRepl(mcu)
@@ -235,6 +243,9 @@ def main() -> None:
         for cost in some:
             print(f"{cost.name:32}{cost.median_us:10.1f}{cost.greatest_us:10.1f}")
     print_loads(loads)
+    if is_documented:
+        text = DOCUMENT.read_text(encoding="utf-8")
+        DOCUMENT.write_text(with_figures(text, loads, statuses, heap_free), encoding="utf-8")
     print(f"\n{'a score with news, gains, telemetry':60}{'late frames':>12}{'longest us':>12}{'late us':>10}")
     for name, status in zip(loads, statuses, strict=True):
         counts = f"{status['late_frames']:12d}{status['frame_max_us']:12d}{status['late_max_us']:10d}"
