@@ -1,16 +1,18 @@
 """The future of the base motion, 254 frames and more of it, and the frequency bands that follow from it.
 
-Two rings hold the base of every processed DOF from the past to the future (see `bands`). What is to come is computed in blocks, near
-frames first, from an outlook that is taken anew whenever something arrives; a front of exact frames moves on through the future and
-then keeps a little more than what the bands need ahead of the motion. All that is done between frames, in portions whose size
-follows from the tables and from who plays, never from the time that is left, so that every MCU computes the same.
+Two rings hold the base of every processed DOF from the past to the future (see `bands`). What is to come is computed in
+blocks, near frames first, from an outlook that is taken anew whenever something arrives; a front of exact frames moves on
+through the future and then keeps a little more than what the bands need ahead of the motion. All that is done between
+frames, in portions whose size follows from the tables and from who plays, never from the time that is left, so that every MCU
+computes the same.
 
-In the frame in which something arrives, the signal is what it would have been: `e` takes up what `corr` changes by. So the new future need
-not be known until the frame has been computed. Its near part is, in full, before the next frame. For the rest, the motion is sketched twice
-at 16 knots, as it would have been and as it will be, and what was known follows the difference, straight from knot to
-knot, until the front comes by.
+In the frame in which something arrives, the signal is what it would have been: `e` takes up what `corr` changes by. So the
+new future need not be known until the frame has been computed. Its near part is, in full, before the next frame. For the
+rest, if there is time for it, the motion is sketched twice at 16 knots, as it would have been and as it will be, and what was
+known follows the difference, straight from knot to knot, until the front comes by.
 
-Source: SPEC of motion signal processing. It wants the whole future at once; what the sketch lacks is what the bound of 1/50 is for.
+Source: SPEC of motion signal processing. It wants the whole future at once; what a sketch lacks is what the bound of 1/50
+is for.
 """
 
 import gc
@@ -142,8 +144,8 @@ def _copy_halves(source: ptr16, target: ptr16, count: int):
 class Future:
     """What the bands of the next frame are, and what it takes to know that.
 
-    `level_q16` has `G_0 .. G_7` of the next frame as they are to be expected, 8 x 16 words with `bands.ZERO_Q16` added. `pending` tells that
-    `work` is left.
+    `level_q16` has `G_0 .. G_7` of the next frame as they are to be expected, 8 x 16 words with `bands.ZERO_Q16` added.
+    `pending` tells that `work` is left.
     """
 
     def __init__(self, sine):
@@ -212,7 +214,7 @@ class Future:
         self._foresight.evaluate(tables, self._outlook, BLOCK, 1, puppet)
 
     def correct_start(self, tables):
-        """Note, in frame 0, that something has arrived that was not there for `start`: what that has foreseen counts as before."""
+        """Note, in frame 0, that something has arrived that `start` did not know: what it has foreseen counts as before."""
         for b in range(BLOCK):
             self._recall(tables, b)
         self._is_sketched = self._is_sketchy = True
@@ -400,7 +402,7 @@ class Future:
     # --- beginnings
 
     def start(self, tables, puppet, base_q15):
-        """Begin with frame 0, which has just been rehearsed, and had the same base in all the past; compute the future of it in `work`."""
+        """Begin with frame 0, which has just been rehearsed and had its base in all the past; `work` computes its future."""
         self._frame = 0
         self._fill(tables, -_PAST, _PAST + _FAR, base_q15, 1, 0)
         _spread(tables.dofs, base_q15, self._before_q15)
@@ -425,7 +427,7 @@ class Future:
         self.pending = self._has_news = self._is_exchanged = self._is_sketched = False
 
     def exchange(self, before, tables, puppet, scratch):
-        """Prepare for other tables, between frames and with no work pending, while all state is still that of the tables `before`.
+        """Prepare for other tables, between frames and with no work pending, while all state is that of the tables `before`.
 
         What is to be expected is sketched now; the rows of DOFs that stay are kept. The next frame has news.
         """

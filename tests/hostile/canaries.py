@@ -59,6 +59,9 @@ def install(width):
     for name in list(sys.modules):
         if name.split(".")[0] in ("firmware", "shared"):
             del sys.modules[name]
+    for name in ("perform", "Board", "room"):  # by which an RP2040's main program would hold all of it fast
+        globals().pop(name, None)
+    gc.collect()
     sys.modules["array"] = module
     builtins.bytearray = bytes_between
 

@@ -35,7 +35,7 @@ from tests.motion.checked_mcu import CheckedMcu
 CANARIES = Path(canaries.__file__)
 PC_WIDTH = 1024
 """Elements of a canary; an index of 8 bits that goes wrong lands in it, wherever it comes from."""
-PICO_WIDTH = 8
+PICO_WIDTH = 4
 PICO_START_US = 5_000_000
 """Longer than it takes to make all arrays, with a collection of the heap before each."""
 ROUNDS = 3
@@ -231,7 +231,7 @@ def do_harm(mcu, dof=0):
     mapping["dof"] = dof
     for name, fields, items in parts:
         attack.say(name, fields, items)
-    for action in (0, 70):
+    for action in (0, 65):
         attack.say("weight_targets", {"frame": 0}, [{"action": action, "target_q28": formats.WEIGHT_ONE}])
     attack.say("start")
     attack.wait(10 * FRAME_US)
