@@ -114,6 +114,18 @@ def _load(playing: ptr8, found: int, mappings: ptr8) -> int:
 
 
 @micropython.viper
+def _processed(dofs: int, signal: ptr8) -> int:
+    """Return how many DOFs are processed."""
+    count = 0
+    d = 0
+    while d < dofs:
+        if signal[d]:
+            count += 1
+        d += 1
+    return count
+
+
+@micropython.viper
 def _spread(dofs: int, value_q15: ptr16, block_q15: ptr16):
     """Write one value per DOF to all 16 places that a block has for it."""
     at = 0
@@ -182,6 +194,7 @@ class Future:
         self._had_news = False
         self._is_exchanged = False
         self._is_sketched = False
+        self._is_idle = False  # whether there is nobody who wants to know
         self._is_sketchy = True  # whether there is time for sketches
         self._fixed_us = self._sketch_us = self._frame_us = 1
         self._block = BLOCK  # frames that are computed at once
@@ -194,6 +207,8 @@ class Future:
 
     def before_news(self, tables, puppet):
         """Note what is to be expected before anything that arrives in this frame has acted, if that has not been done in time."""
+        if self._is_idle:
+            return
         if not self._is_sketched:
             self._sketch_before(tables, puppet)
         self._has_news = True
@@ -215,6 +230,8 @@ class Future:
 
     def correct_start(self, tables):
         """Note, in frame 0, that something has arrived that `start` did not know: what it has foreseen counts as before."""
+        if self._is_idle:
+            return
         for b in range(BLOCK):
             self._recall(tables, b)
         self._is_sketched = self._is_sketchy = True
@@ -226,6 +243,9 @@ class Future:
 
     def advance(self, tables, puppet, base_q15):
         """Turn to the next frame, the one under way having been computed: `work` is to be done until then."""
+        if self._is_idle:
+            self._frame += 1
+            return
         if self._has_news:
             self._recall(tables, 0)
             _copy_halves(base_q15, self._base_column_q15, tables.dofs)
@@ -403,7 +423,11 @@ class Future:
 
     def start(self, tables, puppet, base_q15):
         """Begin with frame 0, which has just been rehearsed and had its base in all the past; `work` computes its future."""
+        self.stop()
         self._frame = 0
+        self._is_idle = not _processed(tables.dofs, tables.signal)
+        if self._is_idle:
+            return
         self._fill(tables, -_PAST, _PAST + _FAR, base_q15, 1, 0)
         _spread(tables.dofs, base_q15, self._before_q15)
         self._sketch(tables, puppet, True)
@@ -431,6 +455,13 @@ class Future:
 
         What is to be expected is sketched now; the rows of DOFs that stay are kept. The next frame has news.
         """
+        was_idle = self._is_idle
+        self._is_idle = not _processed(tables.dofs, tables.signal)
+        if self._is_idle:
+            self.stop()
+            return
+        if was_idle:
+            self._bent_until = self._filled = self._frame + _FAR
         self._sketch_before(before, puppet)
         keep = tables.keep_dof
         rows = self._rows

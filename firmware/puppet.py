@@ -144,12 +144,13 @@ class Puppet:
         if self.future.pending:
             micropython.heap_lock()  # as in a frame
             try:
-                is_done = not self.future.work(self.tables, self)
+                self.future.work(self.tables, self)
             finally:
                 micropython.heap_unlock()
-            if is_done and self._is_starting:
-                self._is_starting = False
-                self.clock.start(self.motor.start(), self.tables.frame_rate_hz)
+            return True
+        if self._is_starting:
+            self._is_starting = False
+            self.clock.start(self.motor.start(), self.tables.frame_rate_hz)
             return True
         if self.exchange.step < 0:
             return False

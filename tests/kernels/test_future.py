@@ -58,3 +58,8 @@ def test_copy_takes_so_many_and_no_more(source, target, count):
     copied = halves(target)
     MODULE._copy_halves(halves(source), copied, count)
     assert list(copied) == source[:count] + target[count:]
+
+
+def test_processed_dofs_are_counted():
+    for dofs, signal, expected in ((1, [0], 0), (3, [1, 0, 1], 2), (2, [1, 0, 1], 1), (16, [1] * 16, 16)):
+        assert MODULE._processed(dofs, bytes(signal)) == expected

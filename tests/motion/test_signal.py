@@ -368,3 +368,32 @@ def test_signals_end_at_the_ends_of_their_ranges():
         far = abs(expected.signal[:, j] - numpy.clip(expected.signal[:, j], low + 0.05, high - 0.05)) >= 0.05
         assert far.sum() > 60 and expected.is_clamped[:, j].sum() > 60
         assert signal[:, j].min() == low and signal[:, j].max() == high
+
+
+def test_signal_processing_begins_and_ends_with_the_tables_that_ask_for_it():
+    """While nobody asks, no future is computed; once the past has filled again the signal is that of tables that always asked."""
+    puppet = {
+        "name": "late",
+        "frame_rate": 30,
+        "dof": {"A": {"signal": True}},
+        "action": {"MOVE": {"tempo": 0.5, "map": [["A", 0.2, 0.8, "rsin"]]}},
+    }
+    score = {"cue": [{"at": 0.0, "weights": {"MOVE": 1}, "gains": [2, 2, 2, 2, -1, 0, 1.5]}]}
+    aside = {**puppet, "dof": {"A": {"signal": False}}}
+    expected = render_signal(puppet, score, 700)
+    with UnixMcu() as mcu:
+        stage = Stage(mcu, puppet_of(aside), score_of(score, puppet_of(aside)))
+        stage.play_until(60)
+        stage.exchange(puppet_of(puppet))
+        begun = len(stage.seen)
+        stage.play_until(begun + 2 * WINDOW + 40)
+        stage.exchange(puppet_of(aside))
+        ended = len(stage.seen)
+        stage.play_until(ended + 30)
+    base, signal = numpy.array([taps["A"][:2] for taps in stage.seen]).T / 32768
+    assert numpy.array_equal(signal[:60], base[:60])
+    assert numpy.array_equal(signal[ended + 5 :], base[ended + 5 :])
+    settled = slice(begun + WINDOW + 40, begun + 2 * WINDOW + 30)
+    limit = rest_bounds(expected.gains)[settled]
+    assert (numpy.abs(signal[settled] - expected.signal[settled, 0]) <= limit).all()
+    assert numpy.abs(signal[settled] - base[settled]).max() > 0.1
