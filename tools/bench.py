@@ -107,7 +107,7 @@ from firmware.link import Link
 link = Link(board, puppet)
 puppet.motor.heard()
 link.telemetry.ask(7, 1, 1)
-board.send = timers_for(2)[1]
+board.send = timers_for(3)[1]
 def report():
     puppet.motor.heard()
     puppet.motor.tapped[0] = puppet.frame - 1
