@@ -188,6 +188,7 @@ class Future:
         self._bent_until = 0
         self._stage = _DONE
         self._quota = 0
+        self._calm_quota = 0  # of frames without news, 0 if it is not known
         self._dof = 0
         self._has_news = False
         self._has_changed = False
@@ -218,7 +219,8 @@ class Future:
         a = puppet.actions
         a.compute_phases(tables, puppet.master, tables.frame_rate_hz)  # which lists who plays
         self._weigh(tables, a.playing, a.found)
-        self._is_sketchy = self._can_sketch(tables, self._left_us(tables))
+        more_us = 0 if self._had_news else _BURST_US
+        self._is_sketchy = self._can_sketch(tables, self._left_us(tables) + more_us)
         if self._is_sketchy:
             self._sketch(tables, puppet, False)
             _copy_halves(self._foresight.future_q15, self._before_q15, tables.dofs * BLOCK)
@@ -318,13 +320,25 @@ class Future:
             self._weigh(tables, self._outlook.playing, self._outlook.found)
             self._front = self._frame
             self._has_changed = True
-        us = self._left_us(tables)
+        if self._has_changed:
+            self._quota = self._share(tables, 0 if self._had_news else _BURST_US)
+            self._calm_quota = 0
+        else:
+            if self._calm_quota == 0:
+                self._calm_quota = self._share(tables, 0)
+            self._quota = self._calm_quota
+        self._had_news = self._has_changed
+        if self._stage == _COMPUTE and self._front >= self._frame + _AHEAD:
+            self._stage = _SPLIT
+
+    def _share(self, tables, more_us):
+        """Return how many frames to come there is time for until the next frame, and some more time."""
+        us = self._left_us(tables) + more_us
         if self._can_sketch(tables, us):
             us -= self._sketch_us  # of what is there before the next news
         if self._stage == _BEND:
             us -= _NEWS_US + _NEWS_DOF_US * tables.dofs + self._sketch_us
-        self._quota = self._portion(us)
-        self._had_news = self._has_changed
+        return self._portion(us)
 
     def _differ(self, tables, base_q15):
         """Note what has changed at the knots; the first one is the frame that has been, whose base is known."""
@@ -386,8 +400,7 @@ class Future:
         """Return what is left of a period when the frame has been computed."""
         tick_us = _TICK_US + _TICK_DOF_US * tables.dofs
         percent = max(20, 100 - _LINK_PERCENT - 100 * tick_us // tables.motor_period_us)
-        left_us = 10000 * percent // tables.frame_rate_hz - self._fixed_us
-        return left_us if self._had_news else left_us + _BURST_US
+        return 10000 * percent // tables.frame_rate_hz - self._fixed_us
 
     def _portion(self, us):
         """Return how many frames to come are computed in a time."""
@@ -442,6 +455,7 @@ class Future:
         self._front = 1
         self._weigh(tables, self._outlook.playing, self._outlook.found)
         self._quota = self._portion(_START_US)
+        self._calm_quota = 0
         self._has_news = self._has_changed = self._had_news = self._is_exchanged = self._is_sketched = False
         self._stage = _COMPUTE
         self.pending = True

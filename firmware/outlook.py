@@ -154,7 +154,10 @@ def _sketch_phases(
         o = (offset_q28[i] - _ONE_Q28) >> 8
         most = ((step_cycles << 22) + step_q22) >> 3
         a = (warp_q26[i] >> 11) + 1
-        limit = ((most << 9) // a) << 6
+        limit = (most << 9) // a
+        if limit > 0x3FFFF:
+            limit = 0x3FFFF
+        limit = limit << 6
         at = n << 4
         b = 0
         while b < knots:

@@ -94,7 +94,8 @@ def evaluate(pool, phase=(0, 0), lives=None):
     value = halves([7])
     actions = SimpleNamespace(playing=b"\0", found=1, cycle=halves([phase[0]]), fraction_q24=words([phase[1]]))
     t = tables([pool], [[(0, 0, 0, ONE)]])
-    machine().evaluate(t, actions, SINE, GRADIENTS, words(lives), value)
+    engine = machine()
+    engine.evaluate(t, actions, SINE, GRADIENTS, words(lives), value)
     assert 0 <= value[0] <= ONE
     return value[0]
 
@@ -118,7 +119,8 @@ def add(tables, playing, phases, weights, lives, sums, spacing_q2=None, pace_q22
     )
     spacing_q2 = halves(spacing_q2 or [0] * frames)
     shift = bytes(SHIFTS[: len(tables.signal)])
-    machine().add(tables, outlook, SINE, GRADIENTS, frames, spacing_q2, FADE_Q15, shift, *sums)
+    engine = machine()
+    engine.add(tables, outlook, SINE, GRADIENTS, frames, spacing_q2, FADE_Q15, shift, *sums)
 
 
 SHIFTS = (0, 3, 6, 16)
@@ -406,7 +408,8 @@ def test_function_that_is_no_program_or_stands_in_its_action_already_is_left_alo
     t.function = bytes([formats.FUNCTION_RSIN, formats.FUNCTION_PROGRAM, formats.FUNCTION_PROGRAM])
     t.same = halves([0, 1, 1])
     actions = SimpleNamespace(playing=b"\0", found=1, cycle=halves([0]), fraction_q24=words([0]))
-    machine().evaluate(t, actions, SINE, GRADIENTS, words([]), value)
+    engine = machine()
+    engine.evaluate(t, actions, SINE, GRADIENTS, words([]), value)
     assert list(value) == [value_q15, ONE // 4, value_q15]
 
 
