@@ -10,7 +10,7 @@ PROTOCOL counts changes of meaning; the checksum of this dictionary catches chan
 exchanged by `hello` and `welcome`, whose layout, with that of `ack`, never changes.
 """
 
-PROTOCOL = 3
+PROTOCOL = 4  # not 3: a greeting that comes while the firmware starts would have Ctrl-C in it
 
 HELLO = 0x10
 PING = 0x11

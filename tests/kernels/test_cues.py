@@ -155,9 +155,10 @@ def test_targets_act_in_their_frame_in_order_and_the_rest_waits(targets, frame, 
 
 
 def test_count_of_late_targets_stays_where_it_needs_no_memory():
-    counts = words([(1 << 30) - 2, 0])
+    counts = words([(1 << 30) - 2, 0, 0, 0])
     queue = Queue([Target(5, MODULE.WEIGHT, 0, 0)] * 3)
-    assert MODULE._apply(6, 3, *queue.arrays, words([0]), words([0]), words([0]), words([0]), counts) == 0
+    rest = words([0]), words([0]), words([0]), words([0]), words([0])
+    assert MODULE._apply(6, 1, 3, *queue.arrays, *rest, counts) == 0
     assert counts[0] == (1 << 30) - 1
 
 

@@ -63,11 +63,17 @@ def test_dump_tells_what_was_sent_and_what_came(capture):
     assert times == sorted(times) and times[-1] > 1
 
 
+LIVE_FIELDS = {
+    "live": 3, "rest_q28": 1 << 27, "rise_q26": 1, "fall_q26": 1 << 24, "predict": 0, "process_q16": 0, "noise_q16": 0,
+    "fade_q15": 0,
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("name", "fields", "items", "expected"),
     [
         ("ping", {}, [], "ping"),
-        ("live", {"live": 3, "rest_q28": 1 << 27, "rise_q26": 1, "fall_q26": 1 << 24}, [], "rest=0.5 rise=1.49012e-08 fall=0.25"),
+        ("live", LIVE_FIELDS, [], "rest=0.5 rise=1.49012e-08 fall=0.25"),
         ("calibrate", {"dof": 0, "end0_q4us": 16008, "end1_q4us": 0, "dead_q15": 0, "top_q15": 0}, [], "us dead=0 top=0"),
         ("guard", {"dof": 0, "release_ms": 9, "duty_q15": 0, "window_s": 8}, [], "release=9 ms duty=0 window=8 s"),
         ("save_begin", {"bytes": 9, "crc32": 255}, [], "bytes=9 crc32=000000ff"),

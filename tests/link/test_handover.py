@@ -32,17 +32,6 @@ def answer(mcu, wait_us=300_000):
 
 
 @pytest.mark.images
-def test_bytes_that_come_while_the_firmware_starts_do_not_call_for_the_repl(rp2040_mcu):
-    """A host greets from the first moment on, and its packets have bytes 3 in them, be it the protocol's number."""
-    with rp2040_mcu() as mcu:
-        for _ in range(WARM_UP_US // 500):
-            mcu.send(b"\x03")
-            mcu.run_for(500)
-        session = Session(VirtualCarrier(mcu))
-        session.open()
-        assert session.welcome["frame"] == -1
-
-
 @pytest.mark.parametrize(
     "pieces",
     [
