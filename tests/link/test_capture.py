@@ -73,7 +73,7 @@ LIVE_FIELDS = {
     ("name", "fields", "items", "expected"),
     [
         ("ping", {}, [], "ping"),
-        ("live", LIVE_FIELDS, [], "rest=0.5 rise=1.49012e-08 fall=0.25"),
+        ("live", LIVE_FIELDS, [], "rise=1.49012e-08 fall=0.25 predict=0 process=0 noise=0 fade=0"),
         ("calibrate", {"dof": 0, "end0_q4us": 16008, "end1_q4us": 0, "dead_q15": 0, "top_q15": 0}, [], "us dead=0 top=0"),
         ("guard", {"dof": 0, "release_ms": 9, "duty_q15": 0, "window_s": 8}, [], "release=9 ms duty=0 window=8 s"),
         ("save_begin", {"bytes": 9, "crc32": 255}, [], "bytes=9 crc32=000000ff"),

@@ -4,12 +4,10 @@ import itertools
 
 import pytest
 
-from marotte.link import VirtualCarrier
 from marotte.mcu.raw_repl import RawRepl
 from marotte.mcu.unix import UnixMcu
 from marotte.pulses import pulses
-from marotte.session import Session
-from tests.link.stage import FRAME_US, WARM_UP_US, begin_performance
+from tests.link.stage import FRAME_US, begin_performance
 
 RAW_BANNER = b"raw REPL; CTRL-B to exit\r\n>"
 
