@@ -49,7 +49,7 @@ class Board:
             self._pieces.pop(0)
         return count
 
-    def send(self, data, length):
+    def send(self, data, length, is_telemetry=False):
         self.sent.append(bytes(data[:length]))
 
     def heap_free(self):
