@@ -39,6 +39,9 @@ _BEND_DOFS = const(6)  # that one portion bends
 
 # What work costs on an RP2040 at 125 MHz, in microseconds, a little more than was measured (`make bench`).
 _LINK_PERCENT = const(12)  # of a period
+_QUICK_HZ = const(35)  # above that, what the link takes counts for more
+_QUICK_PERCENT = const(10)
+_QUICK_US = const(3700)
 _TICK_US = const(250)  # a motor tick
 _TICK_DOF_US = const(75)
 _FIXED_US = const(2800)  # the frame under way, its bands
@@ -61,7 +64,7 @@ _FRAME_MAPPING_NS = const(700)
 _FRAME_WORD_NS = const(1000)
 _FRAME_LIVE_NS = const(6000)
 _BURST_US = const(1000)  # by which news may delay the next frame, if there was none in the frame before
-_SLICE_US = const(6000)  # that one portion may take
+_SLICES = const(5)  # portions of a period: none takes longer
 _START_US = const(160000)  # for the future of frame 0
 
 _BEGIN = const(0)  # stages of work
@@ -389,7 +392,8 @@ class Future:
         frame_ns = _FRAME_NS + _FRAME_DOF_NS * t.dofs + _FRAME_ACTION_NS * found + _FRAME_MAPPING_NS * mappings
         frame_us = (frame_ns + _FRAME_WORD_NS * words + _FRAME_LIVE_NS * t.lives) // 1000
         block_us = _BLOCK_US + _BLOCK_MAPPING_US * mappings
-        self._block = min(BLOCK, max(1, (_SLICE_US - block_us) // frame_us))
+        slice_us = 1000000 // (_SLICES * t.frame_rate_hz)
+        self._block = min(BLOCK, max(1, (slice_us - block_us) // frame_us))
         self._frame_us = frame_us + block_us // self._block
 
     def _can_sketch(self, tables, us):
@@ -400,6 +404,8 @@ class Future:
         """Return what is left of a period when the frame has been computed."""
         tick_us = _TICK_US + _TICK_DOF_US * tables.dofs
         percent = max(20, 100 - _LINK_PERCENT - 100 * tick_us // tables.motor_period_us)
+        if tables.frame_rate_hz > _QUICK_HZ:
+            return 10000 * (percent - _QUICK_PERCENT) // tables.frame_rate_hz - self._fixed_us - _QUICK_US - _BURST_US
         return 10000 * percent // tables.frame_rate_hz - self._fixed_us
 
     def _portion(self, us):
