@@ -29,7 +29,6 @@ def answer(mcu, wait_us=300_000):
     return b"".join(data for _, data in mcu.receive())
 
 
-@pytest.mark.images
 @pytest.mark.parametrize(
     "pieces",
     [
