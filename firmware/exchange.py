@@ -103,6 +103,7 @@ class Exchange:
         for mapping in range(puppet.staged.mappings):
             self._old_mapping[mapping] = _NOT_KEPT
         self._swap()
+        puppet.processing.load(puppet.tables.frame_rate_hz)
         puppet.motor.load(puppet.tables)
 
     def carry_over(self):
@@ -112,6 +113,7 @@ class Exchange:
         new = puppet.staged
         scratch = self._scratch
         a = puppet.actions
+        puppet.future.exchange(old, new, puppet, scratch)
         keep = new.keep_action
         count = new.actions
         for values in (a.target_q28, a.x_q28, a.w_q28, a.before_q28, a.start_q18, a.fraction_q24):
@@ -129,7 +131,9 @@ class Exchange:
             if keep[live] == NEW:
                 for values in puppet.live_state:
                     values[live] = new.live_rest_q28[live]
+        puppet.kalman.rearrange(gather_words, keep, scratch, new)
         keep = new.keep_dof
+        puppet.processing.rearrange(gather_words, keep, scratch, new.dofs)
         for values in puppet.hold_state:
             gather_words(values, keep, scratch, new.dofs, WEIGHT_ONE, 0)
         for values in (puppet.base_q15, puppet.hold_q15):

@@ -15,8 +15,9 @@ from firmware.puppet import Puppet
 from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
-_CHUNKS = 4  # of bytes that are taken in one pass while no frame is due
-_WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board; a USB write may take 1100
+_CHUNKS = 5  # of bytes that are taken in one pass: all that a host has under way, and a kill
+_OVERDUE_US = 20000  # a frame that is so late waits for what has come, as a kill may be among it
+_WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board
 
 
 def _pass(board, puppet, link):
@@ -30,7 +31,7 @@ def _pass(board, puppet, link):
     for _ in range(_CHUNKS):
         if link.poll():
             return None
-        if not link.is_behind or (puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0):
+        if not link.is_behind or (puppet.frame >= 0 and -_OVERDUE_US < puppet.clock.until_us(board.ticks_us()) <= 0):
             break
     if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0:
         puppet.step()
@@ -48,7 +49,9 @@ def perform(board, room=None):
     `room` is a list with a buffer at the low end of the heap, which is freed then: what is allocated later, for a moment, is
     found there without a search through all that stays.
     """
+    gc.collect()
     puppet = Puppet(board)
+    gc.collect()  # garbage between what stays would leave a heap full of holes
     motor = puppet.motor
     link = Link(board, puppet)
     try:

@@ -29,6 +29,7 @@ def answer(mcu, wait_us=300_000):
     return b"".join(data for _, data in mcu.receive())
 
 
+@pytest.mark.images
 @pytest.mark.parametrize(
     "pieces",
     [

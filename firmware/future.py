@@ -1,0 +1,525 @@
+"""The future of the base motion, 254 frames and more of it, and the frequency bands that follow from it.
+
+Two rings hold the base of every processed DOF from the past to the future (see `bands`). What is to come is computed in
+blocks, near frames first, from an outlook that is taken anew whenever something arrives; a front of exact frames moves on
+through the future and then keeps a little more than what the bands need ahead of the motion. All that is done between
+frames, in portions whose size follows from the tables and from who plays, never from the time that is left, so that every MCU
+computes the same.
+
+In the frame in which something arrives, the signal is what it would have been: `e` takes up what `corr` changes by. So the
+new future need not be known until the frame has been computed. Its near part is, in full, before the next frame. For the
+rest, if there is time for it, the motion is sketched twice at 16 knots, as it would have been and as it will be, and what was
+known follows the difference, straight from knot to knot, until the front comes by.
+
+Source: SPEC of motion signal processing. It wants the whole future at once; what a sketch lacks is what the bound of 1/50
+is for.
+"""
+
+import gc
+import sys
+
+import micropython
+from micropython import const
+
+from firmware import bands
+from firmware.exchange import gather_words
+from firmware.foresight import Foresight
+from firmware.outlook import BLOCK, Outlook
+from firmware.tables import halves, words
+from shared.formats import DOFS_MAX, NEW
+
+KNOTS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 72, 108, 162, 254)
+"""Frames of a sketch, from the present one on: the taps of the bands reach as far."""
+
+_PROGRAM = const(6)  # as in shared.formats
+_AHEAD = const(256)  # frames that are kept ahead at least, one more than the next frame's bands need
+_PAST = const(255)
+_FAR = const(271)
+_BEND_DOFS = const(6)  # that one portion bends
+
+# What work costs on an RP2040 at 125 MHz, in microseconds, a little more than was measured (`make bench`).
+_LINK_PERCENT = const(12)  # of a period
+_QUICK_HZ = const(35)  # above that, what the link takes counts for more
+_QUICK_PERCENT = const(10)
+_QUICK_US = const(3700)
+_TICK_US = const(250)  # a motor tick
+_TICK_DOF_US = const(75)
+_FIXED_US = const(2800)  # the frame under way, its bands
+_FIXED_DOF_US = const(60)
+_FIXED_ACTION_US = const(10)
+_FIXED_MAPPING_US = const(9)
+_NEWS_US = const(1400)  # to begin anew
+_NEWS_DOF_US = const(230)
+_SKETCH_US = const(2000)  # one sketch
+_SKETCH_DOF_US = const(20)
+_SKETCH_ACTION_US = const(150)
+_SKETCH_MAPPING_US = const(25)
+_SKETCH_WORD_US = const(16)
+_BLOCK_US = const(500)  # a block of frames to come
+_BLOCK_MAPPING_US = const(5)
+_FRAME_NS = const(25000)  # a frame in it
+_FRAME_DOF_NS = const(8000)
+_FRAME_ACTION_NS = const(14000)
+_FRAME_MAPPING_NS = const(700)
+_FRAME_WORD_NS = const(1000)
+_FRAME_LIVE_NS = const(6000)
+_BURST_US = const(1000)  # by which news may delay the next frame, if there was none in the frame before
+_SLICES = const(5)  # portions of a period: none takes longer
+_START_US = const(160000)  # for the future of frame 0
+
+_BEGIN = const(0)  # stages of work
+_BEND = const(1)
+_COMPUTE = const(2)
+_SPLIT = const(3)
+_SKETCH = const(4)
+_DONE = const(5)
+
+
+@micropython.viper
+def _program_words(
+    playing: ptr8,
+    found: int,
+    first_mapping: ptr16,
+    mappings: ptr8,
+    mapped_dof: ptr8,
+    signal: ptr8,
+    function: ptr8,
+    argument: ptr16,
+    program_words: ptr16,
+) -> int:
+    """Return how many words the programs of the playing actions have, on DOFs that are processed."""
+    total = 0
+    n = 0
+    while n < found:
+        i = int(playing[n])
+        m = int(first_mapping[i])
+        end = m + int(mappings[i])
+        while m < end:
+            d = int(mapped_dof[m])
+            if signal[d] and int(function[m]) == _PROGRAM:
+                k = int(argument[m])
+                total += int(program_words[k])
+            m += 1
+        n += 1
+    return total
+
+
+@micropython.viper
+def _load(playing: ptr8, found: int, mappings: ptr8) -> int:
+    """Return how many mappings the playing actions have."""
+    total = 0
+    n = 0
+    while n < found:
+        i = int(playing[n])
+        total += int(mappings[i])
+        n += 1
+    return total
+
+
+@micropython.viper
+def _processed(dofs: int, signal: ptr8) -> int:
+    """Return how many DOFs are processed."""
+    count = 0
+    d = 0
+    while d < dofs:
+        if signal[d]:
+            count += 1
+        d += 1
+    return count
+
+
+@micropython.viper
+def _spread(dofs: int, value_q15: ptr16, block_q15: ptr16):
+    """Write one value per DOF to all 16 places that a block has for it."""
+    at = 0
+    end = dofs << 4
+    while at < end:
+        block_q15[at] = value_q15[at >> 4]
+        at += 1
+
+
+@micropython.viper
+def _put_knot(dofs: int, value_q15: ptr16, block_q15: ptr16, knot: int):
+    """Write one value per DOF to one of the 16 places that a block has for it."""
+    d = 0
+    while d < dofs:
+        block_q15[(d << 4) + knot] = value_q15[d]
+        d += 1
+
+
+@micropython.viper
+def _copy_halves(source: ptr16, target: ptr16, count: int):
+    """Copy 16-bit words."""
+    i = 0
+    while i < count:
+        target[i] = source[i]
+        i += 1
+
+
+class Future:
+    """What the bands of the next frame are, and what it takes to know that.
+
+    `level_q16` has `G_0 .. G_7` of the next frame as they are to be expected, 8 x 16 words with `bands.ZERO_Q16` added.
+    `pending` tells that `work` is left.
+    """
+
+    def __init__(self, sine):
+        self._taps = bands.tap_table()
+        self._smooth, self._split, self._bend = bands.smooth, bands.split, bands.bend
+        if sys.platform == "rp2":
+            from firmware import bands_thumb
+
+            self._taps.extend(bands_thumb.quartets(self._taps))
+            self._smooth, self._split, self._bend = bands_thumb.smooth, bands_thumb.split, bands_thumb.bend
+        gc.collect()  # what that took would leave holes behind
+        self._base_q15 = halves(DOFS_MAX * bands.RING)
+        self._third_q15 = halves(DOFS_MAX * bands.RING)
+        self.pending = False
+        self.level_q16 = words(bands.LEVELS * DOFS_MAX)
+        self._outlook = Outlook(KNOTS)
+        self._foresight = Foresight(sine, KNOTS)
+        self._row = bytearray(range(DOFS_MAX))
+        self._rows = bytearray(DOFS_MAX)
+        self._before_q15 = halves(DOFS_MAX * BLOCK)
+        self._delta_q15 = words(DOFS_MAX * BLOCK)
+        self._column_q15 = halves(DOFS_MAX)
+        self._base_column_q15 = halves(DOFS_MAX)  # the base of a frame with news
+        self._scratch = words(BLOCK + 1 + 24)
+        self._frame = 0  # the one that comes next
+        self._front = 0  # the first one that is not exact
+        self._filled = 0  # the first one of which nothing is known
+        self._bent_until = 0
+        self._stage = _DONE
+        self._quota = 0
+        self._calm_quota = 0  # of frames without news, 0 if it is not known
+        self._dof = 0
+        self._has_news = False
+        self._has_changed = False
+        self._had_news = False
+        self._is_exchanged = False
+        self._is_sketched = False
+        self._is_idle = False  # whether there is nobody who wants to know
+        self._is_sketchy = True  # whether there is time for sketches
+        self._fixed_us = self._sketch_us = self._frame_us = 1
+        self._block = BLOCK  # frames that are computed at once
+
+    # --- in a frame
+
+    def has_news(self):
+        """Return whether the frame under way has news because of an exchange of tables."""
+        return self._is_exchanged
+
+    def before_news(self, tables, puppet):
+        """Note what is to be expected before anything that arrives in this frame has acted, if that has not been done in time."""
+        if self._is_idle:
+            return
+        if not self._is_sketched:
+            self._sketch_before(tables, puppet)
+        self._has_news = True
+        self._is_exchanged = False
+
+    def _sketch_before(self, tables, puppet):
+        a = puppet.actions
+        a.compute_phases(tables, puppet.master, tables.frame_rate_hz)  # which lists who plays
+        self._weigh(tables, a.playing, a.found)
+        more_us = 0 if self._had_news else _BURST_US
+        self._is_sketchy = self._can_sketch(tables, self._left_us(tables) + more_us)
+        if self._is_sketchy:
+            self._sketch(tables, puppet, False)
+            _copy_halves(self._foresight.future_q15, self._before_q15, tables.dofs * BLOCK)
+        self._is_sketched = True
+
+    def _sketch(self, tables, puppet, is_behind):
+        self._outlook.sketch(tables, puppet, is_behind, BLOCK)
+        self._foresight.evaluate(tables, self._outlook, BLOCK, 1, puppet)
+
+    def correct_start(self, tables):
+        """Note, in frame 0, that something has arrived that `start` did not know: what it has foreseen counts as before."""
+        if self._is_idle:
+            return
+        for b in range(BLOCK):
+            self._recall(tables, b)
+        self._is_sketched = self._is_sketchy = True
+
+    def _recall(self, tables, knot):
+        """Take what was to be expected at a knot from the ring."""
+        bands.column(self._base_q15, self._row, tables.dofs, self._frame + KNOTS[knot], self._column_q15)
+        _put_knot(tables.dofs, self._column_q15, self._before_q15, knot)
+
+    def advance(self, tables, puppet, base_q15):
+        """Turn to the next frame, the one under way having been computed: `work` is to be done until then."""
+        if self._is_idle:
+            self._frame += 1
+            return
+        if self._has_news:
+            self._recall(tables, 0)
+            _copy_halves(base_q15, self._base_column_q15, tables.dofs)
+        else:
+            bands.put_column(self._base_q15, self._row, tables.dofs, self._frame, base_q15)
+        self._frame += 1
+        self._stage = _BEGIN
+        self._has_changed = False
+        self.pending = True
+
+    # --- between frames
+
+    def work(self, tables, puppet):
+        """Do a portion of what is to be done before the next frame; return whether there is more."""
+        stage = self._stage
+        if stage == _BEGIN:
+            self._begin(tables, puppet)
+        elif stage == _BEND:
+            self._bend_some(tables)
+        elif stage == _COMPUTE:
+            if self._quota > 0 and self._front < self._frame + _AHEAD:
+                self._compute(tables, puppet)
+            else:
+                self._stage = _SPLIT
+        elif stage == _SPLIT:
+            if self._has_changed:
+                self._levels(tables, self._frame - 1)
+                puppet.processing.follow(tables, self.level_q16)
+            self._levels(tables, self._frame)
+            self._stage = _DONE
+            if puppet.cues.has_news(self._frame) and self._frame:
+                self._stage = _SKETCH
+        else:
+            self._sketch_before(tables, puppet)
+            self._stage = _DONE
+        self.pending = self._stage != _DONE
+        return self.pending
+
+    def _levels(self, tables, frame):
+        # fmt: off
+        self._split(
+            self._base_q15, self._third_q15, self._row, tables.dofs, tables.signal, frame, self._taps, self.level_q16
+        )
+        # fmt: on
+
+    def _begin(self, tables, puppet):
+        """See how many frames are to be computed; if there was news, sketch what is to be expected now and begin anew."""
+        self._stage = _COMPUTE
+        until = self._filled
+        if self._has_news:
+            if self._is_sketchy:
+                self._sketch(tables, puppet, True)
+                self._differ(tables, self._base_column_q15)
+                self._bent_until = until
+                self._dof = 0
+                self._stage = _BEND
+            else:
+                bands.put_column(self._base_q15, self._row, tables.dofs, self._frame - 1, self._base_column_q15)
+        if until < self._frame + _AHEAD - 1:
+            frames = self._frame + _FAR - until
+            if self._stage == _BEND:  # the last knot of the sketch is as far away
+                self._fill(tables, until, frames, self._foresight.future_q15, BLOCK, BLOCK - 1)
+            else:
+                bands.column(self._base_q15, self._row, tables.dofs, until - 1, self._column_q15)
+                self._fill(tables, until, frames, self._column_q15, 1, 0)
+            self._filled += frames
+        if self._has_news:
+            self._has_news = self._is_sketched = False
+            self._outlook.take(self._frame, tables, puppet)
+            self._weigh(tables, self._outlook.playing, self._outlook.found)
+            self._front = self._frame
+            self._has_changed = True
+        if self._has_changed:
+            self._quota = self._share(tables, 0 if self._had_news else _BURST_US)
+            self._calm_quota = 0
+        else:
+            if self._calm_quota == 0:
+                self._calm_quota = self._share(tables, 0)
+            self._quota = self._calm_quota
+        self._had_news = self._has_changed
+        if self._stage == _COMPUTE and self._front >= self._frame + _AHEAD:
+            self._stage = _SPLIT
+
+    def _share(self, tables, more_us):
+        """Return how many frames to come there is time for until the next frame, and some more time."""
+        us = self._left_us(tables) + more_us
+        if self._can_sketch(tables, us):
+            us -= self._sketch_us  # of what is there before the next news
+        if self._stage == _BEND:
+            us -= _NEWS_US + _NEWS_DOF_US * tables.dofs + self._sketch_us
+        return self._portion(us)
+
+    def _differ(self, tables, base_q15):
+        """Note what has changed at the knots; the first one is the frame that has been, whose base is known."""
+        _put_knot(tables.dofs, base_q15, self._foresight.future_q15, 0)
+        # fmt: off
+        bands.differ(
+            tables.dofs, tables.signal, BLOCK, self._foresight.future_q15, self._before_q15, self._delta_q15
+        )
+        # fmt: on
+
+    def _bend_some(self, tables):
+        """Let what is known of the future follow the change, for some of the DOFs."""
+        dofs = min(tables.dofs, self._dof + _BEND_DOFS)
+        # fmt: off
+        self._bend(
+            self._base_q15, self._third_q15, self._row, dofs, tables.signal, self._dof, self._frame - 1,
+            self._bent_until, self._outlook.knots, self._delta_q15,
+        )
+        # fmt: on
+        self._dof = dofs
+        if dofs == tables.dofs:
+            # Where the change begins it is not straight, and what is smoothed has to be smoothed anew.
+            first = self._frame - 1 - bands.THIRD_REACH
+            self._smooth_some(tables, first, BLOCK + 1)
+            self._smooth_some(tables, first + BLOCK + 1, bands.THIRD_REACH)
+            self._stage = _COMPUTE
+
+    def _smooth_some(self, tables, first, frames):
+        # fmt: off
+        self._smooth(
+            self._base_q15, self._third_q15, self._row, tables.dofs, tables.signal, first, frames, self._scratch
+        )
+        # fmt: on
+
+    def _weigh(self, tables, playing, found):
+        """Note what frames to come and sketches cost for the actions of a list, so many microseconds, whatever MCU this is."""
+        t = tables
+        # fmt: off
+        words = _program_words(
+            playing, found, t.first_mapping, t.mapping_count, t.mapped_dof, t.signal, t.function, t.argument,
+            t.program_words,
+        ) if t.programs else 0
+        # fmt: on
+        mappings = _load(playing, found, t.mapping_count)
+        self._fixed_us = _FIXED_US + _FIXED_DOF_US * t.dofs + _FIXED_ACTION_US * found + _FIXED_MAPPING_US * mappings
+        self._sketch_us = _SKETCH_US + _SKETCH_DOF_US * t.dofs + _SKETCH_ACTION_US * found
+        self._sketch_us += _SKETCH_MAPPING_US * mappings + _SKETCH_WORD_US * words
+        frame_ns = _FRAME_NS + _FRAME_DOF_NS * t.dofs + _FRAME_ACTION_NS * found + _FRAME_MAPPING_NS * mappings
+        frame_us = (frame_ns + _FRAME_WORD_NS * words + _FRAME_LIVE_NS * t.lives) // 1000
+        block_us = _BLOCK_US + _BLOCK_MAPPING_US * mappings
+        slice_us = 1000000 // (_SLICES * t.frame_rate_hz)
+        self._block = min(BLOCK, max(1, (slice_us - block_us) // frame_us))
+        self._frame_us = frame_us + block_us // self._block
+
+    def _can_sketch(self, tables, us):
+        """Return whether two sketches fit into a time, and what follows them."""
+        return _NEWS_US + _NEWS_DOF_US * tables.dofs + 2 * self._sketch_us < us
+
+    def _left_us(self, tables):
+        """Return what is left of a period when the frame has been computed."""
+        tick_us = _TICK_US + _TICK_DOF_US * tables.dofs
+        percent = max(20, 100 - _LINK_PERCENT - 100 * tick_us // tables.motor_period_us)
+        if tables.frame_rate_hz > _QUICK_HZ:
+            return 10000 * (percent - _QUICK_PERCENT) // tables.frame_rate_hz - self._fixed_us - _QUICK_US - _BURST_US
+        return 10000 * percent // tables.frame_rate_hz - self._fixed_us
+
+    def _portion(self, us):
+        """Return how many frames to come are computed in a time."""
+        return min(_FAR, max(1, us // self._frame_us))
+
+    def _fill(self, tables, first, frames, value_q15, stride, at):
+        # fmt: off
+        bands.fill(
+            self._base_q15, self._third_q15, self._row, tables.dofs, tables.signal, first, frames, value_q15, stride, at
+        )
+        # fmt: on
+
+    def _compute(self, tables, puppet):
+        """Compute the next block of frames to come."""
+        front = self._front
+        bands.column(self._base_q15, self._row, tables.dofs, front - 1, self._column_q15)
+        frames = self._outlook.write(tables, min(self._block, self._quota), self._column_q15)
+        self._foresight.evaluate(tables, self._outlook, frames, 0, puppet)
+        # fmt: off
+        bands.put_block(
+            self._base_q15, self._row, tables.dofs, tables.signal, front, frames, self._foresight.future_q15
+        )
+        # fmt: on
+        self._smooth_some(tables, front - bands.THIRD_REACH - 1, frames + 1)
+        if front < self._frame + _AHEAD - 1:
+            self._has_changed = True
+        self._quota -= frames
+        self._front = front + frames
+        if self._filled < self._front:
+            self._filled = self._front
+
+    # --- beginnings
+
+    def start(self, tables, puppet, base_q15):
+        """Begin with frame 0, which has just been rehearsed and had its base in all the past; `work` computes its future."""
+        self.stop()
+        self._frame = 0
+        self._is_idle = not _processed(tables.dofs, tables.signal)
+        if self._is_idle:
+            return
+        self._fill(tables, -_PAST, _PAST + _FAR, base_q15, 1, 0)
+        _spread(tables.dofs, base_q15, self._before_q15)
+        self._sketch(tables, puppet, True)
+        self._differ(tables, base_q15)
+        self._frame = 1  # the sketch counts from the frame before
+        self._dof = 0
+        self._bent_until = self._filled = _FAR
+        while self._dof < tables.dofs:
+            self._bend_some(tables)
+        self._frame = 0
+        self._outlook.take(1, tables, puppet)
+        self._front = 1
+        self._weigh(tables, self._outlook.playing, self._outlook.found)
+        self._quota = self._portion(_START_US)
+        self._calm_quota = 0
+        self._has_news = self._has_changed = self._had_news = self._is_exchanged = self._is_sketched = False
+        self._stage = _COMPUTE
+        self.pending = True
+
+    def stop(self):
+        """Forget what was to be done."""
+        self.pending = self._has_news = self._is_exchanged = self._is_sketched = False
+
+    def exchange(self, before, tables, puppet, scratch):
+        """Prepare for other tables, between frames and with no work pending, while all state is that of the tables `before`.
+
+        What is to be expected is sketched now; the rows of DOFs that stay are kept. The next frame has news.
+        """
+        was_idle = self._is_idle
+        self._is_idle = not _processed(tables.dofs, tables.signal)
+        if self._is_idle:
+            self.stop()
+            return
+        if was_idle:
+            self._bent_until = self._filled = self._frame + _FAR
+        self._sketch_before(before, puppet)
+        keep = tables.keep_dof
+        rows = self._rows
+        taken = 0
+        for d in range(tables.dofs):
+            was = keep[d]
+            if was != NEW and before.signal[was]:
+                taken |= 1 << self._row[was]
+        old_q15 = self._foresight.future_q15
+        free = 0
+        for d in range(tables.dofs):
+            was = keep[d]
+            if was != NEW and before.signal[was]:
+                rows[d] = self._row[was]
+                for b in range(BLOCK):
+                    old_q15[d * BLOCK + b] = self._before_q15[was * BLOCK + b]
+            else:
+                while taken >> free & 1:
+                    free += 1
+                rows[d] = free
+                taken |= 1 << free
+        _copy_halves(old_q15, self._before_q15, tables.dofs * BLOCK)
+        for at in range(0, bands.LEVELS * DOFS_MAX, DOFS_MAX):
+            gather_words(self.level_q16, keep, scratch, tables.dofs, 0, at)
+        for d in range(DOFS_MAX):
+            self._row[d] = rows[d]
+        for d in range(tables.dofs):
+            was = keep[d]
+            if was == NEW or not before.signal[was]:
+                self._begin_row(d, tables.rest_q15[d] if was == NEW else puppet.base_q15[was])
+        self._is_exchanged = True
+
+    def _begin_row(self, dof, value_q15):
+        """Let a DOF have been at one value, and stay there."""
+        first = self._row[dof] * bands.RING
+        for place in range(first, first + bands.RING):
+            self._base_q15[place] = self._third_q15[place] = value_q15
+        for at in range(dof, bands.LEVELS * DOFS_MAX, DOFS_MAX):
+            self.level_q16[at] = (value_q15 << 1) + bands.ZERO_Q16
+        for b in range(BLOCK):
+            self._before_q15[dof * BLOCK + b] = value_q15
