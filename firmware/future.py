@@ -26,7 +26,7 @@ from firmware.exchange import gather_words
 from firmware.foresight import Foresight
 from firmware.outlook import BLOCK, Outlook
 from firmware.tables import halves, words
-from shared.formats import DOFS_MAX, NEW
+from shared.formats import DOFS_MAX
 
 KNOTS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 72, 108, 162, 254)
 """Frames of a sketch, from the present one on: the taps of the bands reach as far."""
@@ -35,13 +35,13 @@ _PROGRAM = const(6)  # as in shared.formats
 _AHEAD = const(256)  # frames that are kept ahead at least, one more than the next frame's bands need
 _PAST = const(255)
 _FAR = const(271)
+_DOFS = const(16)
+_NEW = const(255)  # as in shared.formats
+_ZERO_Q16 = const(0x100000)  # as in bands
 _BEND_DOFS = const(6)  # that one portion bends
 
 # What work costs on an RP2040 at 125 MHz, in microseconds, a little more than was measured (`make bench`).
 _LINK_PERCENT = const(12)  # of a period
-_QUICK_HZ = const(35)  # above that, what the link takes counts for more
-_QUICK_PERCENT = const(10)
-_QUICK_US = const(3700)
 _TICK_US = const(250)  # a motor tick
 _TICK_DOF_US = const(75)
 _FIXED_US = const(2800)  # the frame under way, its bands
@@ -156,11 +156,97 @@ def _copy_halves(source: ptr16, target: ptr16, count: int):
         i += 1
 
 
+@micropython.viper
+def _match_rows(
+    dofs: int,
+    keep: ptr8,
+    signal: ptr8,
+    row: ptr8,
+    new_row: ptr8,
+    rest_q15: ptr16,
+    base_q15: ptr16,
+    before_q15: ptr16,
+    after_q15: ptr16,
+    value_q15: ptr16,
+):
+    """Give every new DOF the row that it had, or if it had none one that is free, and what it was to be expected to do.
+
+    A DOF that begins to be processed begins with `value`: its rest, or where it is.
+    """
+    taken = 0
+    d = 0
+    while d < dofs:
+        was = int(keep[d])
+        if was != _NEW:
+            if signal[was]:
+                taken = taken | (1 << int(row[was]))
+        d += 1
+    free = 0
+    d = 0
+    while d < dofs:
+        was = int(keep[d])
+        kept = 0
+        a = int(rest_q15[d])
+        if was != _NEW:
+            kept = int(signal[was])
+            a = int(base_q15[was])
+        value_q15[d] = a
+        if kept:
+            new_row[d] = row[was]
+        else:
+            while (taken >> free) & 1:
+                free += 1
+            new_row[d] = free
+            taken = taken | (1 << free)
+        b = 0
+        while b < 16:
+            if kept:
+                a = int(before_q15[(was << 4) + b])
+            after_q15[(d << 4) + b] = a
+            b += 1
+        d += 1
+
+
+@micropython.viper
+def _begin_rows(
+    dofs: int,
+    keep: ptr8,
+    signal: ptr8,
+    row: ptr8,
+    value_q15: ptr16,
+    base: ptr32,
+    third: ptr32,
+    level_q16: ptr32,
+):
+    """Let every DOF that was not processed have been at its `value` always, and stay there; rings are written by pairs."""
+    d = 0
+    while d < dofs:
+        was = int(keep[d])
+        kept = 0
+        if was != _NEW:
+            kept = int(signal[was])
+        if kept == 0:
+            a = int(value_q15[d])
+            pair = a | (a << 16)
+            at = int(row[d]) << 8
+            end = at + 256
+            while at < end:
+                base[at] = pair
+                third[at] = pair
+                at += 1
+            k = d
+            while k < 128:
+                level_q16[k] = (a << 1) + _ZERO_Q16
+                k += 16
+        d += 1
+
+
 class Future:
     """What the bands of the next frame are, and what it takes to know that.
 
     `level_q16` has `G_0 .. G_7` of the next frame as they are to be expected, 8 x 16 words with `bands.ZERO_Q16` added.
-    `pending` tells that `work` is left.
+    `pending` tells that `work` is left, `cut_short` in how many periods since `start` some of it was left out. `is_sketched` tells
+    that it has been noted what is to be expected from the next frame on.
     """
 
     def __init__(self, sine):
@@ -175,6 +261,8 @@ class Future:
         self._base_q15 = halves(DOFS_MAX * bands.RING)
         self._third_q15 = halves(DOFS_MAX * bands.RING)
         self.pending = False
+        self.cut_short = 0
+        self.is_sketched = False
         self.level_q16 = words(bands.LEVELS * DOFS_MAX)
         self._outlook = Outlook(KNOTS)
         self._foresight = Foresight(sine, KNOTS)
@@ -197,7 +285,6 @@ class Future:
         self._has_changed = False
         self._had_news = False
         self._is_exchanged = False
-        self._is_sketched = False
         self._is_idle = False  # whether there is nobody who wants to know
         self._is_sketchy = True  # whether there is time for sketches
         self._fixed_us = self._sketch_us = self._frame_us = 1
@@ -213,12 +300,13 @@ class Future:
         """Note what is to be expected before anything that arrives in this frame has acted, if that has not been done in time."""
         if self._is_idle:
             return
-        if not self._is_sketched:
-            self._sketch_before(tables, puppet)
+        if not self.is_sketched:
+            self.sketch_before(tables, puppet)
         self._has_news = True
         self._is_exchanged = False
 
-    def _sketch_before(self, tables, puppet):
+    def sketch_before(self, tables, puppet):
+        """Note what is to be expected if nothing arrives, from the frame that comes next on."""
         a = puppet.actions
         a.compute_phases(tables, puppet.master, tables.frame_rate_hz)  # which lists who plays
         self._weigh(tables, a.playing, a.found)
@@ -227,7 +315,7 @@ class Future:
         if self._is_sketchy:
             self._sketch(tables, puppet, False)
             _copy_halves(self._foresight.future_q15, self._before_q15, tables.dofs * BLOCK)
-        self._is_sketched = True
+        self.is_sketched = True
 
     def _sketch(self, tables, puppet, is_behind):
         self._outlook.sketch(tables, puppet, is_behind, BLOCK)
@@ -239,7 +327,7 @@ class Future:
             return
         for b in range(BLOCK):
             self._recall(tables, b)
-        self._is_sketched = self._is_sketchy = True
+        self.is_sketched = self._is_sketchy = True
 
     def _recall(self, tables, knot):
         """Take what was to be expected at a knot from the ring."""
@@ -250,6 +338,7 @@ class Future:
         """Turn to the next frame, the one under way having been computed: `work` is to be done until then."""
         if self._is_idle:
             self._frame += 1
+            self.is_sketched = False
             return
         if self._has_news:
             self._recall(tables, 0)
@@ -258,7 +347,7 @@ class Future:
             bands.put_column(self._base_q15, self._row, tables.dofs, self._frame, base_q15)
         self._frame += 1
         self._stage = _BEGIN
-        self._has_changed = False
+        self._has_changed = self.is_sketched = False
         self.pending = True
 
     # --- between frames
@@ -284,10 +373,31 @@ class Future:
             if puppet.cues.has_news(self._frame) and self._frame:
                 self._stage = _SKETCH
         else:
-            self._sketch_before(tables, puppet)
+            self.sketch_before(tables, puppet)
             self._stage = _DONE
         self.pending = self._stage != _DONE
         return self.pending
+
+    def relent(self):
+        """Leave out the blocks that are left for this period: something else needs the time."""
+        self._quota = 0
+
+    def finish(self, tables, puppet):
+        """Come to an end, as the next frame is due: what is left for this period is left out, and counted.
+
+        That happens only if the link or the motor layer take more time than `_left_us` allows for. Other MCUs may then compute other
+        signals; but the frame is in time.
+        """
+        self.cut_short += 1
+        self._is_sketchy = False
+        if self._stage == _BEGIN:
+            self._begin(tables, puppet)
+        if self._stage != _SKETCH:
+            self._stage = _SPLIT
+            self.work(tables, puppet)
+        self.is_sketched = True
+        self._stage = _DONE
+        self.pending = False
 
     def _levels(self, tables, frame):
         # fmt: off
@@ -318,7 +428,7 @@ class Future:
                 self._fill(tables, until, frames, self._column_q15, 1, 0)
             self._filled += frames
         if self._has_news:
-            self._has_news = self._is_sketched = False
+            self._has_news = False
             self._outlook.take(self._frame, tables, puppet)
             self._weigh(tables, self._outlook.playing, self._outlook.found)
             self._front = self._frame
@@ -404,8 +514,6 @@ class Future:
         """Return what is left of a period when the frame has been computed."""
         tick_us = _TICK_US + _TICK_DOF_US * tables.dofs
         percent = max(20, 100 - _LINK_PERCENT - 100 * tick_us // tables.motor_period_us)
-        if tables.frame_rate_hz > _QUICK_HZ:
-            return 10000 * (percent - _QUICK_PERCENT) // tables.frame_rate_hz - self._fixed_us - _QUICK_US - _BURST_US
         return 10000 * percent // tables.frame_rate_hz - self._fixed_us
 
     def _portion(self, us):
@@ -443,6 +551,7 @@ class Future:
     def start(self, tables, puppet, base_q15):
         """Begin with frame 0, which has just been rehearsed and had its base in all the past; `work` computes its future."""
         self.stop()
+        self.cut_short = 0
         self._frame = 0
         self._is_idle = not _processed(tables.dofs, tables.signal)
         if self._is_idle:
@@ -462,18 +571,18 @@ class Future:
         self._weigh(tables, self._outlook.playing, self._outlook.found)
         self._quota = self._portion(_START_US)
         self._calm_quota = 0
-        self._has_news = self._has_changed = self._had_news = self._is_exchanged = self._is_sketched = False
+        self._has_news = self._has_changed = self._had_news = self._is_exchanged = self.is_sketched = False
         self._stage = _COMPUTE
         self.pending = True
 
     def stop(self):
         """Forget what was to be done."""
-        self.pending = self._has_news = self._is_exchanged = self._is_sketched = False
+        self.pending = self._has_news = self._is_exchanged = self.is_sketched = False
 
     def exchange(self, before, tables, puppet, scratch):
         """Prepare for other tables, between frames and with no work pending, while all state is that of the tables `before`.
 
-        What is to be expected is sketched now; the rows of DOFs that stay are kept. The next frame has news.
+        `sketch_before` has noted what is to be expected; the rows of DOFs that stay are kept. The next frame has news.
         """
         was_idle = self._is_idle
         self._is_idle = not _processed(tables.dofs, tables.signal)
@@ -482,44 +591,20 @@ class Future:
             return
         if was_idle:
             self._bent_until = self._filled = self._frame + _FAR
-        self._sketch_before(before, puppet)
-        keep = tables.keep_dof
-        rows = self._rows
-        taken = 0
-        for d in range(tables.dofs):
-            was = keep[d]
-            if was != NEW and before.signal[was]:
-                taken |= 1 << self._row[was]
-        old_q15 = self._foresight.future_q15
-        free = 0
-        for d in range(tables.dofs):
-            was = keep[d]
-            if was != NEW and before.signal[was]:
-                rows[d] = self._row[was]
-                for b in range(BLOCK):
-                    old_q15[d * BLOCK + b] = self._before_q15[was * BLOCK + b]
-            else:
-                while taken >> free & 1:
-                    free += 1
-                rows[d] = free
-                taken |= 1 << free
-        _copy_halves(old_q15, self._before_q15, tables.dofs * BLOCK)
-        for at in range(0, bands.LEVELS * DOFS_MAX, DOFS_MAX):
-            gather_words(self.level_q16, keep, scratch, tables.dofs, 0, at)
-        for d in range(DOFS_MAX):
-            self._row[d] = rows[d]
-        for d in range(tables.dofs):
-            was = keep[d]
-            if was == NEW or not before.signal[was]:
-                self._begin_row(d, tables.rest_q15[d] if was == NEW else puppet.base_q15[was])
+        # fmt: off
+        _match_rows(
+            tables.dofs, tables.keep_dof, before.signal, self._row, self._rows, tables.rest_q15, puppet.base_q15,
+            self._before_q15, self._foresight.future_q15, self._column_q15,
+        )
+        # fmt: on
+        _copy_halves(self._foresight.future_q15, self._before_q15, tables.dofs * BLOCK)
+        for at in range(0, bands.LEVELS * _DOFS, _DOFS):
+            gather_words(self.level_q16, tables.keep_dof, scratch, tables.dofs, 0, at)
+        self._row, self._rows = self._rows, self._row
+        # fmt: off
+        _begin_rows(
+            tables.dofs, tables.keep_dof, before.signal, self._row, self._column_q15, self._base_q15, self._third_q15,
+            self.level_q16,
+        )
+        # fmt: on
         self._is_exchanged = True
-
-    def _begin_row(self, dof, value_q15):
-        """Let a DOF have been at one value, and stay there."""
-        first = self._row[dof] * bands.RING
-        for place in range(first, first + bands.RING):
-            self._base_q15[place] = self._third_q15[place] = value_q15
-        for at in range(dof, bands.LEVELS * DOFS_MAX, DOFS_MAX):
-            self.level_q16[at] = (value_q15 << 1) + bands.ZERO_Q16
-        for b in range(BLOCK):
-            self._before_q15[dof * BLOCK + b] = value_q15

@@ -181,7 +181,7 @@ class Kalman:
         for live in range(tables.lives):
             self._position_q28[live] = tables.live_rest_q28[live]
             self.velocity_q28[live] = ZERO_Q28
-            for place in range(live, 3 * LIVES_MAX, LIVES_MAX):
+            for place in range(live, 3 * _LIVES, _LIVES):
                 self._covariance_q16[place] = 0
 
     def step(self, tables, arrived, target_q28):
@@ -207,7 +207,7 @@ class Kalman:
         """Let other tables have other channels; those that were not there before stand at their rest."""
         gather_words(self.velocity_q28, keep, scratch, tables.lives, ZERO_Q28, 0)
         gather_words(self._position_q28, keep, scratch, tables.lives, 0, 0)
-        for place in range(0, 3 * LIVES_MAX, LIVES_MAX):
+        for place in range(0, 3 * _LIVES, _LIVES):
             gather_words(self._covariance_q16, keep, scratch, tables.lives, 0, place)
         for live in range(tables.lives):
             if keep[live] == NEW:

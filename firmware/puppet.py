@@ -33,7 +33,7 @@ from shared.formats import (
 )
 
 _COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
-_CARRY_US = const(16000)  # what putting other tables into force takes
+_CARRY_US = const(21000)  # what putting other tables into force takes
 _MARGIN_US = const(3000)  # between the end of a frame and what is done then
 
 
@@ -137,13 +137,15 @@ class Puppet:
     def prepare(self):
         """Take a step of what is to be done between frames; return whether there was one to take.
 
-        That is the future that signal processing wants to know, and then an exchange of tables. The last two steps of that
-        collect what tables leave on the heap, so that it does not fill up in the middle of a frame, and put the new tables into
-        force. They wait until there is time for that.
+        That is the future that signal processing wants to know, and then an exchange of tables, for which blocks of that
+        future are left out. The last steps collect what tables leave on the heap, so that it does not fill up in the middle of a
+        frame, note what is to be expected, and put the new tables into force. They wait until there is time for that.
         """
         if self.future.pending:
             micropython.heap_lock()  # as in a frame
             try:
+                if self._exchange_due:
+                    self.future.relent()
                 self.future.work(self.tables, self)
             finally:
                 micropython.heap_unlock()
@@ -176,8 +178,8 @@ class Puppet:
         """Compute the frame that is due and hand it to the motors."""
         begun_us = self._board.ticks_us()
         self.clock.begin(begun_us)
-        while self.future.pending:  # all that could not be done between frames
-            self.future.work(self.tables, self)
+        if self.future.pending:
+            self.future.finish(self.tables, self)
         self._synthesise(False)
         self.base_ring.put(self.frame, self.tables.dofs, self.base_q15)
         self.motor.put(self.frame, self.signal_q15)

@@ -167,7 +167,7 @@ class SignalProcessing:
 
     def rearrange(self, gather_words, keep, scratch, dofs):
         """Let other tables have other DOFs; new ones have no offset."""
-        for at in range(0, 2 * DOFS_MAX, DOFS_MAX):
+        for at in range(0, 2 * _DOFS, _DOFS):
             gather_words(self._offset_q20, keep, scratch, dofs, ZERO_Q20, at)
 
     def glide(self):

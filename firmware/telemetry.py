@@ -165,6 +165,7 @@ class Telemetry:
             _STATUS_FORMAT, link.out, _PAYLOAD, puppet.frame, motor.armed, motor.silent,
             puppet.clock.late_max_us, motor.late_frames, puppet.frame_max_us, link.packets, link.damaged,
             puppet.cues.counts[0], puppet.cues.refused, self._heap_free, puppet.clipped,
+            puppet.future.cut_short,
         )
         link.send(messages.STATUS, _STATUS_END)
         pack_into(

@@ -259,6 +259,7 @@ MESSAGES = (
             ("refused_targets", "I"),
             ("heap_free", "I"),
             ("clipped", "I"),
+            ("cut_short", "I"),
         ),
         (),
     ),
