@@ -144,20 +144,27 @@ def split(
 
 
 @micropython.viper
-def differ(dofs: int, signal: ptr8, knots: int, after_q15: ptr16, before_q15: ptr16, delta_q15: ptr32):
-    """Write what has changed at the knots, 16 per DOF, with 2^16 added; beyond the last known knot it stays."""
+def differ(
+    dofs: int, signal: ptr8, knots: int, after_q15: ptr16, before_q15: ptr16, delta_q15: ptr32, changed: ptr8
+) -> int:
+    """Write what has changed at the knots, 16 places per DOF, with 2^16 added; mark and count the DOFs of which anything has."""
+    count = 0
     d = 0
     while d < dofs:
+        found = 0
         if signal[d]:
             at = d << 4
-            b = 0
-            change = _DELTA_ZERO
-            while b < 16:
-                if b < knots:
-                    change = int(after_q15[at + b]) - int(before_q15[at + b]) + _DELTA_ZERO
-                delta_q15[at + b] = change
-                b += 1
+            end = at + knots
+            while at < end:
+                change = int(after_q15[at]) - int(before_q15[at])
+                if change:
+                    found = 1
+                delta_q15[at] = change + _DELTA_ZERO
+                at += 1
+        changed[d] = found
+        count += found
         d += 1
+    return count
 
 
 @micropython.viper
@@ -166,28 +173,32 @@ def bend(
     third_q15: ptr16,
     row: ptr8,
     dofs: int,
-    signal: ptr8,
+    changed: ptr8,
     first_dof: int,
     frame: int,
     end: int,
     knot: ptr8,
+    first_knot: int,
+    knots: int,
     delta_q15: ptr32,
 ):
-    """Let both rings follow a change, straight from knot to knot, from `frame` to before `end`; DOFs from `first_dof` to `dofs`.
+    """Let both rings follow a change, straight from knot to knot, from `first_knot` to before frame `end`.
 
-    Bits: a change and its slope have 8 binary places more, 2^24.
+    Knots are counted from `frame`, DOFs are those from `first_dof` to before `dofs`; behind the last knot the change stays. Bits: a
+    change and its slope have 8 binary places more, 2^24.
     """
+    last = knots - 1
     d = first_dof
     while d < dofs:
-        if signal[d]:
+        if changed[d]:
             at = int(row[d]) << 9
-            n = frame
-            b = 0
+            n = frame + int(knot[first_knot])
+            b = first_knot
             while n < end:
                 now = (delta_q15[(d << 4) + b] - _DELTA_ZERO) << 8
                 slope = 0
                 until = end
-                if b < 15:
+                if b < last:
                     until = frame + int(knot[b + 1])
                     if until > end:
                         until = end

@@ -357,27 +357,30 @@ def bend(
     third_q15: ptr16,
     row: ptr8,
     dofs: int,
-    signal: ptr8,
+    changed: ptr8,
     first_dof: int,
     frame: int,
     end: int,
     knot: ptr8,
+    first_knot: int,
+    knots: int,
     delta_q15: ptr32,
 ):
     """Do what `bands.bend` does."""
     task = ptr32(_task)
+    last = knots - 1
     d = first_dof
     while d < dofs:
-        if signal[d]:
+        if changed[d]:
             task[0] = int(base_q15) + (int(row[d]) << 10)
             task[1] = int(third_q15) + (int(row[d]) << 10)
-            n = frame
-            b = 0
+            n = frame + int(knot[first_knot])
+            b = first_knot
             while n < end:
                 now = (delta_q15[(d << 4) + b] - _DELTA_ZERO) << 8
                 slope = 0
                 until = end
-                if b < 15:
+                if b < last:
                     until = frame + int(knot[b + 1])
                     if until > end:
                         until = end

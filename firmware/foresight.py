@@ -300,8 +300,8 @@ class Foresight:
         self._sine = sine
         self._fade_q15 = fade_table(sine)
         self._spacing_q2 = halves(BLOCK)
-        for b in range(1, BLOCK):
-            wide = knots[min(b + 1, BLOCK - 1)] - knots[b - 1]
+        for b in range(1, len(knots)):
+            wide = knots[min(b + 1, len(knots) - 1)] - knots[b - 1]
             self._spacing_q2[b] = 2 * wide if wide > 2 else 0
         self._weight_sum = words(DOFS_MAX)
         self._shift = bytearray(DOFS_MAX)

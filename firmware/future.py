@@ -30,6 +30,9 @@ from shared.formats import DOFS_MAX
 
 KNOTS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 72, 108, 162, 254)
 """Frames of a sketch, from the present one on: the taps of the bands reach as far."""
+_KNOTS = const(16)
+_NEAR_KNOT = const(11)  # up to it the future follows at once
+_NEAR_FRAMES = const(48)  # which are so many
 
 _PROGRAM = const(6)  # as in shared.formats
 _AHEAD = const(256)  # frames that are kept ahead at least, one more than the next frame's bands need
@@ -42,33 +45,37 @@ _BEND_DOFS = const(6)  # that one portion bends
 
 # What work costs on an RP2040 at 125 MHz, in microseconds, a little more than was measured (`make bench`).
 _LINK_PERCENT = const(12)  # of a period
-_TICK_US = const(250)  # a motor tick
-_TICK_DOF_US = const(75)
+_TICK_US = const(700)  # a motor tick
+_TICK_DOF_US = const(30)
 _FIXED_US = const(2800)  # the frame under way, its bands
 _FIXED_DOF_US = const(60)
 _FIXED_ACTION_US = const(10)
 _FIXED_MAPPING_US = const(9)
-_NEWS_US = const(1400)  # to begin anew
-_NEWS_DOF_US = const(230)
-_SKETCH_US = const(2000)  # one sketch
-_SKETCH_DOF_US = const(20)
-_SKETCH_ACTION_US = const(150)
-_SKETCH_MAPPING_US = const(25)
-_SKETCH_WORD_US = const(16)
-_BLOCK_US = const(500)  # a block of frames to come
-_BLOCK_MAPPING_US = const(5)
-_FRAME_NS = const(25000)  # a frame in it
-_FRAME_DOF_NS = const(8000)
-_FRAME_ACTION_NS = const(14000)
-_FRAME_MAPPING_NS = const(700)
-_FRAME_WORD_NS = const(1000)
-_FRAME_LIVE_NS = const(6000)
-_BURST_US = const(1000)  # by which news may delay the next frame, if there was none in the frame before
-_SLICES = const(5)  # portions of a period: none takes longer
+_NEWS_US = const(1100)  # to begin anew
+_NEWS_DOF_US = const(50)
+_NEAR_US = const(90)  # a DOF whose rings are bent up to the knot `_NEAR`
+_BEND_US = const(120)  # and beyond
+_SKETCH_US = const(500)  # one sketch
+_SKETCH_DOF_US = const(36)
+_SKETCH_ACTION_US = const(105)
+_KNOT_NS = const(66000)  # a knot of it
+_KNOT_ACTION_NS = const(300)
+_KNOT_MAPPING_NS = const(1600)
+_KNOT_WORD_NS = const(700)
+_BLOCK_US = const(850)  # a block of frames to come
+_BLOCK_ACTION_US = const(9)
+_BLOCK_MAPPING_US = const(10)
+_FRAME_NS = const(3000)  # a frame in it
+_FRAME_DOF_NS = const(5500)
+_FRAME_ACTION_NS = const(12000)
+_FRAME_MAPPING_NS = const(200)
+_FRAME_WORD_NS = const(500)
+_FRAME_LIVE_NS = const(1000)
+_PORTION_US = const(4000)  # that is done at once, between looks at what has come
 _START_US = const(160000)  # for the future of frame 0
 
 _BEGIN = const(0)  # stages of work
-_BEND = const(1)
+_NEAR = const(1)
 _COMPUTE = const(2)
 _SPLIT = const(3)
 _SKETCH = const(4)
@@ -278,16 +285,20 @@ class Future:
         self._filled = 0  # the first one of which nothing is known
         self._bent_until = 0
         self._stage = _DONE
-        self._quota = 0
-        self._calm_quota = 0  # of frames without news, 0 if it is not known
+        self._budget_us = 0
+        self._is_bending = False
+        self._origin = 0  # the frame whose news are bent to
+        self._news = 0  # the last frame that had news
         self._dof = 0
         self._has_news = False
         self._has_changed = False
-        self._had_news = False
         self._is_exchanged = False
         self._is_idle = False  # whether there is nobody who wants to know
         self._is_sketchy = True  # whether there is time for sketches
-        self._fixed_us = self._sketch_us = self._frame_us = 1
+        self._left_us = self._sketch_us = self._frame_us = 1
+        self._is_first = False  # whether nothing has been done yet in a period
+        self._changed = bytearray(DOFS_MAX)  # whether a sketch differs from the one before, by DOF
+        self._changes = 0
         self._block = BLOCK  # frames that are computed at once
 
     # --- in a frame
@@ -310,22 +321,23 @@ class Future:
         a = puppet.actions
         a.compute_phases(tables, puppet.master, tables.frame_rate_hz)  # which lists who plays
         self._weigh(tables, a.playing, a.found)
-        more_us = 0 if self._had_news else _BURST_US
-        self._is_sketchy = self._can_sketch(tables, self._left_us(tables) + more_us)
+        while self._is_bending:
+            self._bend_far(tables)
+        self._is_sketchy = self._news_us(tables) + self._sketch_us < self._left_us
         if self._is_sketchy:
             self._sketch(tables, puppet, False)
             _copy_halves(self._foresight.future_q15, self._before_q15, tables.dofs * BLOCK)
         self.is_sketched = True
 
     def _sketch(self, tables, puppet, is_behind):
-        self._outlook.sketch(tables, puppet, is_behind, BLOCK)
-        self._foresight.evaluate(tables, self._outlook, BLOCK, 1, puppet)
+        self._outlook.sketch(tables, puppet, is_behind, _KNOTS)
+        self._foresight.evaluate(tables, self._outlook, _KNOTS, 1, puppet)
 
     def correct_start(self, tables):
         """Note, in frame 0, that something has arrived that `start` did not know: what it has foreseen counts as before."""
         if self._is_idle:
             return
-        for b in range(BLOCK):
+        for b in range(_KNOTS):
             self._recall(tables, b)
         self.is_sketched = self._is_sketchy = True
 
@@ -357,17 +369,26 @@ class Future:
         stage = self._stage
         if stage == _BEGIN:
             self._begin(tables, puppet)
-        elif stage == _BEND:
-            self._bend_some(tables)
+        elif stage == _NEAR:
+            self._bend_near(tables)
+            self._stage = _COMPUTE
         elif stage == _COMPUTE:
-            if self._quota > 0 and self._front < self._frame + _AHEAD:
-                self._compute(tables, puppet)
+            until = self._frame + _AHEAD
+            if self._is_bending:
+                until = min(until, self._origin + _NEAR_FRAMES)
+            if self._budget_us <= 0 and not self._is_first:
+                self._stage = _SPLIT
+            elif self._front < until:
+                self._compute(tables, puppet, until)
+            elif self._is_bending:
+                self._bend_far(tables)
             else:
                 self._stage = _SPLIT
+            self._is_first = False
         elif stage == _SPLIT:
             if self._has_changed:
                 self._levels(tables, self._frame - 1)
-                puppet.processing.follow(tables, self.level_q16)
+                puppet.processing.follow(tables, self.level_q16, self._frame - 1 - self._news)
             self._levels(tables, self._frame)
             self._stage = _DONE
             if puppet.cues.has_news(self._frame) and self._frame:
@@ -380,7 +401,8 @@ class Future:
 
     def relent(self):
         """Leave out the blocks that are left for this period: something else needs the time."""
-        self._quota = 0
+        self._budget_us = 0
+        self._is_first = False
 
     def finish(self, tables, puppet):
         """Come to an end, as the next frame is due: what is left for this period is left out, and counted.
@@ -408,76 +430,77 @@ class Future:
 
     def _begin(self, tables, puppet):
         """See how many frames are to be computed; if there was news, sketch what is to be expected now and begin anew."""
-        self._stage = _COMPUTE
         until = self._filled
-        if self._has_news:
-            if self._is_sketchy:
-                self._sketch(tables, puppet, True)
-                self._differ(tables, self._base_column_q15)
-                self._bent_until = until
-                self._dof = 0
-                self._stage = _BEND
-            else:
-                bands.put_column(self._base_q15, self._row, tables.dofs, self._frame - 1, self._base_column_q15)
-        if until < self._frame + _AHEAD - 1:
-            frames = self._frame + _FAR - until
-            if self._stage == _BEND:  # the last knot of the sketch is as far away
-                self._fill(tables, until, frames, self._foresight.future_q15, BLOCK, BLOCK - 1)
+        frame = self._frame
+        us = 0
+        is_sketched = self._has_news and self._is_sketchy
+        if is_sketched:
+            self._sketch(tables, puppet, True)
+            self._differ(tables, self._base_column_q15)
+            us -= self._sketch_us
+            self._origin = frame - 1
+            self._bent_until = until
+        elif self._has_news:
+            bands.put_column(self._base_q15, self._row, tables.dofs, frame - 1, self._base_column_q15)
+        if until < frame + _AHEAD - 1:
+            frames = frame + _FAR - until
+            if is_sketched:  # the last knot of the sketch is as far away
+                self._fill(tables, until, frames, self._foresight.future_q15, BLOCK, _KNOTS - 1)
             else:
                 bands.column(self._base_q15, self._row, tables.dofs, until - 1, self._column_q15)
                 self._fill(tables, until, frames, self._column_q15, 1, 0)
             self._filled += frames
         if self._has_news:
             self._has_news = False
-            self._outlook.take(self._frame, tables, puppet)
+            self._outlook.take(frame, tables, puppet)
             self._weigh(tables, self._outlook.playing, self._outlook.found)
-            self._front = self._frame
+            self._front = frame
+            self._news = frame - 1
             self._has_changed = True
-        if self._has_changed:
-            self._quota = self._share(tables, 0 if self._had_news else _BURST_US)
-            self._calm_quota = 0
-        else:
-            if self._calm_quota == 0:
-                self._calm_quota = self._share(tables, 0)
-            self._quota = self._calm_quota
-        self._had_news = self._has_changed
-        if self._stage == _COMPUTE and self._front >= self._frame + _AHEAD:
-            self._stage = _SPLIT
-
-    def _share(self, tables, more_us):
-        """Return how many frames to come there is time for until the next frame, and some more time."""
-        us = self._left_us(tables) + more_us
-        if self._can_sketch(tables, us):
-            us -= self._sketch_us  # of what is there before the next news
-        if self._stage == _BEND:
-            us -= _NEWS_US + _NEWS_DOF_US * tables.dofs + self._sketch_us
-        return self._portion(us)
+            us -= self._news_us(tables)
+        us += self._left_us
+        if puppet.cues.has_news(frame):
+            us -= self._sketch_us
+        self._budget_us = us
+        self._is_first = True
+        self._stage = _NEAR if is_sketched else _COMPUTE
 
     def _differ(self, tables, base_q15):
         """Note what has changed at the knots; the first one is the frame that has been, whose base is known."""
         _put_knot(tables.dofs, base_q15, self._foresight.future_q15, 0)
         # fmt: off
-        bands.differ(
-            tables.dofs, tables.signal, BLOCK, self._foresight.future_q15, self._before_q15, self._delta_q15
+        self._changes = bands.differ(
+            tables.dofs, tables.signal, _KNOTS, self._foresight.future_q15, self._before_q15, self._delta_q15, self._changed
         )
         # fmt: on
 
-    def _bend_some(self, tables):
-        """Let what is known of the future follow the change, for some of the DOFs."""
+    def _bend_near(self, tables):
+        """Let what is known of the near future follow the change."""
+        self._bend_rows(tables, 0, tables.dofs, 0, self._origin + _NEAR_FRAMES)
+        # Where the change begins it is not straight, and what is smoothed has to be smoothed anew.
+        begin = self._origin - bands.THIRD_REACH
+        self._smooth_some(tables, begin, BLOCK + 1)
+        self._smooth_some(tables, begin + BLOCK + 1, bands.THIRD_REACH)
+        self._budget_us -= _NEAR_US * self._changes
+        self._dof = 0
+        self._is_bending = True
+
+    def _bend_far(self, tables):
+        """Let the far future of some of the DOFs do so."""
         dofs = min(tables.dofs, self._dof + _BEND_DOFS)
+        self._bend_rows(tables, self._dof, dofs, _NEAR_KNOT, self._bent_until)
+        self._budget_us -= _BEND_US * (dofs - self._dof)
+        self._dof = dofs
+        self._is_bending = dofs < tables.dofs
+        self._has_changed = True
+
+    def _bend_rows(self, tables, first_dof, dofs, first_knot, until):
         # fmt: off
         self._bend(
-            self._base_q15, self._third_q15, self._row, dofs, tables.signal, self._dof, self._frame - 1,
-            self._bent_until, self._outlook.knots, self._delta_q15,
+            self._base_q15, self._third_q15, self._row, dofs, self._changed, first_dof, self._origin, until,
+            self._outlook.knots, first_knot, _KNOTS, self._delta_q15,
         )
         # fmt: on
-        self._dof = dofs
-        if dofs == tables.dofs:
-            # Where the change begins it is not straight, and what is smoothed has to be smoothed anew.
-            first = self._frame - 1 - bands.THIRD_REACH
-            self._smooth_some(tables, first, BLOCK + 1)
-            self._smooth_some(tables, first + BLOCK + 1, bands.THIRD_REACH)
-            self._stage = _COMPUTE
 
     def _smooth_some(self, tables, first, frames):
         # fmt: off
@@ -496,29 +519,21 @@ class Future:
         ) if t.programs else 0
         # fmt: on
         mappings = _load(playing, found, t.mapping_count)
-        self._fixed_us = _FIXED_US + _FIXED_DOF_US * t.dofs + _FIXED_ACTION_US * found + _FIXED_MAPPING_US * mappings
-        self._sketch_us = _SKETCH_US + _SKETCH_DOF_US * t.dofs + _SKETCH_ACTION_US * found
-        self._sketch_us += _SKETCH_MAPPING_US * mappings + _SKETCH_WORD_US * words
+        knot_ns = _KNOT_NS + _KNOT_ACTION_NS * found + _KNOT_MAPPING_NS * mappings + _KNOT_WORD_NS * words
+        self._sketch_us = _SKETCH_US + _SKETCH_DOF_US * t.dofs + _SKETCH_ACTION_US * found + _KNOTS * knot_ns // 1000
+        block_us = _BLOCK_US + _BLOCK_ACTION_US * found + _BLOCK_MAPPING_US * mappings
         frame_ns = _FRAME_NS + _FRAME_DOF_NS * t.dofs + _FRAME_ACTION_NS * found + _FRAME_MAPPING_NS * mappings
         frame_us = (frame_ns + _FRAME_WORD_NS * words + _FRAME_LIVE_NS * t.lives) // 1000
-        block_us = _BLOCK_US + _BLOCK_MAPPING_US * mappings
-        slice_us = 1000000 // (_SLICES * t.frame_rate_hz)
-        self._block = min(BLOCK, max(1, (slice_us - block_us) // frame_us))
+        self._block = min(BLOCK, max(1, (_PORTION_US - block_us) // frame_us))
         self._frame_us = frame_us + block_us // self._block
+        tick_us = _TICK_US + _TICK_DOF_US * t.dofs
+        percent = max(20, 100 - _LINK_PERCENT - 100 * tick_us // t.motor_period_us)
+        fixed_us = _FIXED_US + _FIXED_DOF_US * t.dofs + _FIXED_ACTION_US * found + _FIXED_MAPPING_US * mappings
+        self._left_us = 10000 * percent // t.frame_rate_hz - fixed_us
 
-    def _can_sketch(self, tables, us):
-        """Return whether two sketches fit into a time, and what follows them."""
-        return _NEWS_US + _NEWS_DOF_US * tables.dofs + 2 * self._sketch_us < us
-
-    def _left_us(self, tables):
-        """Return what is left of a period when the frame has been computed."""
-        tick_us = _TICK_US + _TICK_DOF_US * tables.dofs
-        percent = max(20, 100 - _LINK_PERCENT - 100 * tick_us // tables.motor_period_us)
-        return 10000 * percent // tables.frame_rate_hz - self._fixed_us
-
-    def _portion(self, us):
-        """Return how many frames to come are computed in a time."""
-        return min(_FAR, max(1, us // self._frame_us))
+    def _news_us(self, tables):
+        """Return what it costs to begin anew, without a sketch."""
+        return _NEWS_US + _NEWS_DOF_US * tables.dofs
 
     def _fill(self, tables, first, frames, value_q15, stride, at):
         # fmt: off
@@ -527,11 +542,12 @@ class Future:
         )
         # fmt: on
 
-    def _compute(self, tables, puppet):
-        """Compute the next block of frames to come."""
+    def _compute(self, tables, puppet, until):
+        """Compute the next block of frames to come, before frame `until`."""
         front = self._front
+        frames = min(self._block, until - front, max(1, self._budget_us // self._frame_us))
         bands.column(self._base_q15, self._row, tables.dofs, front - 1, self._column_q15)
-        frames = self._outlook.write(tables, min(self._block, self._quota), self._column_q15)
+        frames = self._outlook.write(tables, frames, self._column_q15)
         self._foresight.evaluate(tables, self._outlook, frames, 0, puppet)
         # fmt: off
         bands.put_block(
@@ -541,7 +557,7 @@ class Future:
         self._smooth_some(tables, front - bands.THIRD_REACH - 1, frames + 1)
         if front < self._frame + _AHEAD - 1:
             self._has_changed = True
-        self._quota -= frames
+        self._budget_us -= frames * self._frame_us
         self._front = front + frames
         if self._filled < self._front:
             self._filled = self._front
@@ -560,24 +576,22 @@ class Future:
         _spread(tables.dofs, base_q15, self._before_q15)
         self._sketch(tables, puppet, True)
         self._differ(tables, base_q15)
-        self._frame = 1  # the sketch counts from the frame before
-        self._dof = 0
         self._bent_until = self._filled = _FAR
-        while self._dof < tables.dofs:
-            self._bend_some(tables)
-        self._frame = 0
+        self._origin = self._news = 0
+        self._bend_near(tables)
+        while self._is_bending:
+            self._bend_far(tables)
         self._outlook.take(1, tables, puppet)
         self._front = 1
         self._weigh(tables, self._outlook.playing, self._outlook.found)
-        self._quota = self._portion(_START_US)
-        self._calm_quota = 0
-        self._has_news = self._has_changed = self._had_news = self._is_exchanged = self.is_sketched = False
+        self._budget_us = _START_US
+        self._has_news = self._has_changed = self._is_exchanged = self.is_sketched = False
         self._stage = _COMPUTE
         self.pending = True
 
     def stop(self):
         """Forget what was to be done."""
-        self.pending = self._has_news = self._is_exchanged = self.is_sketched = False
+        self.pending = self._has_news = self._is_exchanged = self.is_sketched = self._is_bending = False
 
     def exchange(self, before, tables, puppet, scratch):
         """Prepare for other tables, between frames and with no work pending, while all state is that of the tables `before`.

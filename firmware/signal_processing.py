@@ -11,7 +11,7 @@ Source: SPEC of motion signal processing; the paper's section on it. There, five
 import micropython
 from micropython import const
 
-from firmware.tables import words
+from firmware.tables import halves, words
 from firmware.trajectory import exp_q15
 from shared.formats import BANDS, DOFS_MAX, GAIN4_ONE
 
@@ -21,6 +21,7 @@ _DOFS = const(16)
 _ZERO = const(0x10000000)
 _GAIN_MS = const(250)  # time constant of the gains
 _OFFSET_MS = const(150)  # of the offset
+_AGES = const(4)  # of news, for which offsets allow
 
 
 @micropython.viper
@@ -114,17 +115,33 @@ def _finish(
 
 
 @micropython.viper
-def _step(dofs: int, signal: ptr8, before_q20: ptr32, after_q20: ptr32, offset_q20: ptr32):
-    """Add to every `e` what `corr` has lost, within 16."""
+def _step(
+    dofs: int,
+    signal: ptr8,
+    before_q20: ptr32,
+    after_q20: ptr32,
+    left_q15: int,
+    lost_q15: int,
+    offset_q20: ptr32,
+):
+    """Add to every `e` what `corr` has lost, times `left`, and subtract it times `lost` from `v / F`; `e` stays within 16.
+
+    Bits: `corr` is within 16, 2^24; limbs of 13 + 12 bits times 15.
+    """
     d = 0
     while d < dofs:
         if signal[d]:
-            off = offset_q20[d] - _ZERO + before_q20[d] - after_q20[d]
+            step = before_q20[d] - after_q20[d]
+            off = offset_q20[d] - _ZERO + ((step >> 12) * left_q15 >> 3) + ((step & 0xFFF) * left_q15 >> 15)
             if off > 0xFFFFFF:
                 off = 0xFFFFFF
             if off < -0xFFFFFF:
                 off = -0xFFFFFF
             offset_q20[d] = off + _ZERO
+            if lost_q15:
+                rate = offset_q20[_DOFS + d] - _ZERO
+                rate -= ((step >> 12) * lost_q15 >> 3) + ((step & 0xFFF) * lost_q15 >> 15)
+                offset_q20[_DOFS + d] = rate + _ZERO
         d += 1
 
 
@@ -150,12 +167,22 @@ class SignalProcessing:
         self._is_active = False
         self._offset_q20 = words(2 * DOFS_MAX)
         self._alpha_q15 = self._keep_q15 = self._share_q15 = 0
+        self._left_q15 = halves(_AGES)  # of an offset of 1 that began so many frames ago
+        self._lost_q15 = halves(_AGES)  # its `-v / F`
 
     def load(self, rate_hz):
         """Take over the frame rate; allocates."""
         self._alpha_q15 = 32768 - exp_q15(1000, _GAIN_MS * rate_hz)
         self._keep_q15 = exp_q15(1000, _OFFSET_MS * rate_hz)
         self._share_q15 = (1000 * 32768 + _OFFSET_MS * rate_hz // 2) // (_OFFSET_MS * rate_hz)
+        left_q15 = 32768
+        lost_q15 = 0
+        for age in range(_AGES):
+            self._left_q15[age] = left_q15
+            self._lost_q15[age] = lost_q15
+            pull_q15 = (left_q15 * self._share_q15 >> 15) - lost_q15
+            left_q15 = (left_q15 + pull_q15) * self._keep_q15 >> 15
+            lost_q15 = (lost_q15 + (pull_q15 * self._share_q15 >> 15)) * self._keep_q15 >> 15
 
     def rest(self):
         """Set what holds before frame 0: all gains 1, no offsets."""
@@ -194,8 +221,18 @@ class SignalProcessing:
         self._is_active = False
         _pass(tables.dofs, base_q15, self._offset_q20, signal_q15)
 
-    def follow(self, tables, level_q16):
-        """Let the offsets take up what the levels of the last frame have become, from what `process` took them for."""
+    def follow(self, tables, level_q16, age):
+        """Let the offsets take up what the levels of the last frame have become, from what `process` took them for.
+
+        `age` is how many frames before that the news came: offsets are what they would be had they begun then, as long as
+        that makes no step worth speaking of.
+        """
         if self._is_active:
+            age = min(age, _AGES - 1)
+            # fmt: off
             _correct(tables.dofs, tables.signal, level_q16, self.gain4_q16, GAIN4_ONE, self._after_q20)
-            _step(tables.dofs, tables.signal, self._corr_q20, self._after_q20, self._offset_q20)
+            _step(
+                tables.dofs, tables.signal, self._corr_q20, self._after_q20, self._left_q15[age], self._lost_q15[age],
+                self._offset_q20,
+            )
+            # fmt: on
