@@ -28,11 +28,11 @@ from firmware.outlook import BLOCK, Outlook
 from firmware.tables import halves, words
 from shared.formats import DOFS_MAX
 
-KNOTS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 72, 108, 162, 254)
+KNOTS = (0, 1, 2, 4, 8, 16, 32, 64, 128, 254)
 """Frames of a sketch, from the present one on: the taps of the bands reach as far."""
-_KNOTS = const(16)
-_NEAR_KNOT = const(11)  # up to it the future follows at once
-_NEAR_FRAMES = const(48)  # which are so many
+_KNOTS = const(10)
+_NEAR_KNOT = const(6)  # up to it the future follows at once
+_NEAR_FRAMES = const(32)  # which are so many
 
 _PROGRAM = const(6)  # as in shared.formats
 _AHEAD = const(256)  # frames that are kept ahead at least, one more than the next frame's bands need
@@ -44,25 +44,26 @@ _ZERO_Q16 = const(0x100000)  # as in bands
 _BEND_DOFS = const(6)  # that one portion bends
 
 # What work costs on an RP2040 at 125 MHz, in microseconds, a little more than was measured (`make bench`).
-_LINK_PERCENT = const(12)  # of a period
-_TICK_US = const(700)  # a motor tick
+_LINK_PERCENT = const(14)  # of a period
+_TICK_US = const(950)  # a motor tick
 _TICK_DOF_US = const(30)
-_FIXED_US = const(2800)  # the frame under way, its bands
+_FIXED_US = const(4800)  # the frame under way, its bands
 _FIXED_DOF_US = const(60)
 _FIXED_ACTION_US = const(10)
 _FIXED_MAPPING_US = const(9)
-_NEWS_US = const(1100)  # to begin anew
+_ENTER_US = const(250)  # an action that has entered
+_NEWS_US = const(1900)  # to begin anew
 _NEWS_DOF_US = const(50)
 _NEAR_US = const(90)  # a DOF whose rings are bent up to the knot `_NEAR`
-_BEND_US = const(120)  # and beyond
-_SKETCH_US = const(500)  # one sketch
+_BEND_US = const(170)  # and beyond
+_SKETCH_US = const(750)  # one sketch
 _SKETCH_DOF_US = const(36)
 _SKETCH_ACTION_US = const(105)
 _KNOT_NS = const(66000)  # a knot of it
 _KNOT_ACTION_NS = const(300)
 _KNOT_MAPPING_NS = const(1600)
 _KNOT_WORD_NS = const(700)
-_BLOCK_US = const(850)  # a block of frames to come
+_BLOCK_US = const(1150)  # a block of frames to come
 _BLOCK_ACTION_US = const(9)
 _BLOCK_MAPPING_US = const(10)
 _FRAME_NS = const(3000)  # a frame in it
@@ -295,7 +296,7 @@ class Future:
         self._is_exchanged = False
         self._is_idle = False  # whether there is nobody who wants to know
         self._is_sketchy = True  # whether there is time for sketches
-        self._left_us = self._sketch_us = self._frame_us = 1
+        self._left_us = self._sketch_us = self._block_us = self._frame_us = 1
         self._is_first = False  # whether nothing has been done yet in a period
         self._changed = bytearray(DOFS_MAX)  # whether a sketch differs from the one before, by DOF
         self._changes = 0
@@ -373,18 +374,7 @@ class Future:
             self._bend_near(tables)
             self._stage = _COMPUTE
         elif stage == _COMPUTE:
-            until = self._frame + _AHEAD
-            if self._is_bending:
-                until = min(until, self._origin + _NEAR_FRAMES)
-            if self._budget_us <= 0 and not self._is_first:
-                self._stage = _SPLIT
-            elif self._front < until:
-                self._compute(tables, puppet, until)
-            elif self._is_bending:
-                self._bend_far(tables)
-            else:
-                self._stage = _SPLIT
-            self._is_first = False
+            self._compute_some(tables, puppet)
         elif stage == _SPLIT:
             if self._has_changed:
                 self._levels(tables, self._frame - 1)
@@ -407,19 +397,25 @@ class Future:
     def finish(self, tables, puppet):
         """Come to an end, as the next frame is due: what is left for this period is left out, and counted.
 
-        That happens only if the link or the motor layer take more time than `_left_us` allows for. Other MCUs may then compute other
-        signals; but the frame is in time.
+        That happens only if the link or the motor layer take more time than is allowed for here. Other MCUs may then compute
+        other signals; but the frame is in time.
         """
-        self.cut_short += 1
-        self._is_sketchy = False
+        is_cut = False
         if self._stage == _BEGIN:
+            self._is_sketchy = False
             self._begin(tables, puppet)
+            is_cut = True
         if self._stage != _SKETCH:
+            is_cut = is_cut or self._stage == _NEAR or (self._stage == _COMPUTE and self._wanted() != 0)
             self._stage = _SPLIT
             self.work(tables, puppet)
-        self.is_sketched = True
+        if self._stage == _SKETCH:
+            self._is_sketchy = False
+            self.is_sketched = is_cut = True
         self._stage = _DONE
         self.pending = False
+        if is_cut:
+            self.cut_short += 1
 
     def _levels(self, tables, frame):
         # fmt: off
@@ -458,11 +454,11 @@ class Future:
             self._news = frame - 1
             self._has_changed = True
             us -= self._news_us(tables)
-        us += self._left_us
+        us += self._left_us - _ENTER_US * puppet.entered
         if puppet.cues.has_news(frame):
             us -= self._sketch_us
         self._budget_us = us
-        self._is_first = True
+        self._is_first = not self._has_changed
         self._stage = _NEAR if is_sketched else _COMPUTE
 
     def _differ(self, tables, base_q15):
@@ -525,7 +521,8 @@ class Future:
         frame_ns = _FRAME_NS + _FRAME_DOF_NS * t.dofs + _FRAME_ACTION_NS * found + _FRAME_MAPPING_NS * mappings
         frame_us = (frame_ns + _FRAME_WORD_NS * words + _FRAME_LIVE_NS * t.lives) // 1000
         self._block = min(BLOCK, max(1, (_PORTION_US - block_us) // frame_us))
-        self._frame_us = frame_us + block_us // self._block
+        self._block_us = block_us
+        self._frame_us = frame_us
         tick_us = _TICK_US + _TICK_DOF_US * t.dofs
         percent = max(20, 100 - _LINK_PERCENT - 100 * tick_us // t.motor_period_us)
         fixed_us = _FIXED_US + _FIXED_DOF_US * t.dofs + _FIXED_ACTION_US * found + _FIXED_MAPPING_US * mappings
@@ -542,10 +539,32 @@ class Future:
         )
         # fmt: on
 
-    def _compute(self, tables, puppet, until):
-        """Compute the next block of frames to come, before frame `until`."""
+    def _compute_some(self, tables, puppet):
+        """Take a step of what is to be computed and bent, as long as the budget lasts, and one at least."""
+        frames = self._wanted()
+        self._is_first = False
+        if frames > 0:
+            self._compute(tables, puppet, frames)
+        elif frames < 0:
+            self._bend_far(tables)
+        else:
+            self._stage = _SPLIT
+
+    def _wanted(self):
+        """Return how many frames are to be computed at once, -1 if rings are to be bent first, 0 if nothing is left to do."""
+        until = self._frame + _FAR
+        if self._is_bending:
+            until = self._origin + _NEAR_FRAMES
+            if self._front >= until:
+                return -1 if self._is_first or self._budget_us > _BEND_US * _BEND_DOFS else 0
+        elif self._front >= self._frame + _AHEAD:
+            return 0
+        frames = (self._budget_us - self._block_us) // self._frame_us
+        return min(self._block, until - self._front, max(frames, 1 if self._is_first else 0))
+
+    def _compute(self, tables, puppet, frames):
+        """Compute the next block of frames to come."""
         front = self._front
-        frames = min(self._block, until - front, max(1, self._budget_us // self._frame_us))
         bands.column(self._base_q15, self._row, tables.dofs, front - 1, self._column_q15)
         frames = self._outlook.write(tables, frames, self._column_q15)
         self._foresight.evaluate(tables, self._outlook, frames, 0, puppet)
@@ -557,7 +576,7 @@ class Future:
         self._smooth_some(tables, front - bands.THIRD_REACH - 1, frames + 1)
         if front < self._frame + _AHEAD - 1:
             self._has_changed = True
-        self._budget_us -= frames * self._frame_us
+        self._budget_us -= self._block_us + frames * self._frame_us
         self._front = front + frames
         if self._filled < self._front:
             self._filled = self._front

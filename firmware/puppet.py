@@ -33,6 +33,7 @@ from shared.formats import (
 )
 
 _COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
+_SHORT_US = const(2000)  # of work, behind which there is time for more before the main loop has its turn
 _CARRY_US = const(21000)  # what putting other tables into force takes
 _MARGIN_US = const(3000)  # between the end of a frame and what is done then
 
@@ -42,7 +43,7 @@ class Puppet:
 
     `frame` is the number of the next frame, -1 while the motion does not run. `base_q15` and `signal_q15` hold the last
     frame's values per DOF, after the compositor and after signal processing; `motor.motor_q15` what the motors were
-    told. `clipped` counts the values that signal processing has clipped at the ends of their range since `start`.
+    told. `entered` is how many actions have entered in the last frame, `clipped` counts the values that signal processing has clipped at the ends of their range since `start`.
     """
 
     def __init__(self, board):
@@ -51,6 +52,7 @@ class Puppet:
         self.frame = -1
         self.frame_max_us = 0
         self.clipped = 0
+        self.entered = 0
         self.clock = clock.FrameClock()
         self.cues = Cues()
         self.drivers = Drivers(board)
@@ -146,7 +148,10 @@ class Puppet:
             try:
                 if self._exchange_due:
                     self.future.relent()
-                self.future.work(self.tables, self)
+                begun_us = self._board.ticks_us()
+                while self.future.work(self.tables, self):
+                    if clock.ticks_diff(self._board.ticks_us(), begun_us) > _SHORT_US:
+                        break
             finally:
                 micropython.heap_unlock()
             return True
@@ -230,7 +235,8 @@ class Puppet:
             t.actions, a.target_q28, t.first_mapping, t.mapping_count, t.mapped_dof,
             t.dofs, t.relative, self.base_q15, self._hold_target_q28, self._hold_w_q28, self.hold_q15, self._wanted,
         )
-        for n in range(a.enter(t, self.master, rate_hz)):
+        self.entered = a.enter(t, self.master, rate_hz)
+        for n in range(self.entered):
             if a.risen[n] >= 128:
                 self.blinks.enter(t, a.risen[n] & 127)
         weights.integrate(t.actions, a.target_q28, a.x_q28, a.w_q28, t.rise_q26, t.fall_q26)
