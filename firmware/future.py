@@ -47,7 +47,7 @@ _BEND_DOFS = const(6)  # that one portion bends
 _LINK_PERCENT = const(14)  # of a period
 _TICK_US = const(950)  # a motor tick
 _TICK_DOF_US = const(30)
-_FIXED_US = const(4800)  # the frame under way, its bands
+_FIXED_US = const(3800)  # the frame under way, its bands
 _FIXED_DOF_US = const(60)
 _FIXED_ACTION_US = const(10)
 _FIXED_MAPPING_US = const(9)
@@ -520,7 +520,7 @@ class Future:
         block_us = _BLOCK_US + _BLOCK_ACTION_US * found + _BLOCK_MAPPING_US * mappings
         frame_ns = _FRAME_NS + _FRAME_DOF_NS * t.dofs + _FRAME_ACTION_NS * found + _FRAME_MAPPING_NS * mappings
         frame_us = (frame_ns + _FRAME_WORD_NS * words + _FRAME_LIVE_NS * t.lives) // 1000
-        self._block = min(BLOCK, max(1, (_PORTION_US - block_us) // frame_us))
+        self._block = min(BLOCK, max(1 + block_us // frame_us, (_PORTION_US - block_us) // frame_us))
         self._block_us = block_us
         self._frame_us = frame_us
         tick_us = _TICK_US + _TICK_DOF_US * t.dofs
