@@ -235,7 +235,7 @@ def _begin_rows(
             kept = int(signal[was])
         if kept == 0:
             a = int(value_q15[d])
-            pair = a | (a << 16)
+            pair = a | ((a - ((a >> 15) << 16)) << 16)
             at = int(row[d]) << 8
             end = at + 256
             while at < end:

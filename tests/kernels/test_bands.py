@@ -105,15 +105,18 @@ def test_levels_of_a_pose_are_the_pose():
 blocks = st.lists(values_q15, min_size=48, max_size=48)
 
 
-@given(blocks, blocks, integers(1, 16))
-def test_change_at_the_knots_stays_what_it_is_at_the_last_one_known(after, before, knots):
-    delta = words([-7] * 48)
-    MODULE.differ(3, SIGNAL, knots, halves(after), halves(before), delta)
+@given(blocks, blocks, integers(1, 16), st.sets(integers(0, 2)))
+def test_change_at_the_knots_is_noted_and_counted(after, before, knots, still):
+    for dof in still:
+        after[16 * dof : 16 * dof + knots] = before[16 * dof : 16 * dof + knots]
+    delta, changed = words([-7] * 48), bytearray(3)
+    count = MODULE.differ(3, SIGNAL, knots, halves(after), halves(before), delta, changed)
     for dof in range(3):
-        expected = [
-            after[16 * dof + min(b, knots - 1)] - before[16 * dof + min(b, knots - 1)] + 65536 for b in range(16)
-        ]
-        assert list(delta[16 * dof : 16 * dof + 16]) == (expected if SIGNAL[dof] else [-7] * 16)
+        differences = [after[16 * dof + b] - before[16 * dof + b] for b in range(knots)]
+        expected = [difference + 65536 for difference in differences] if SIGNAL[dof] else [-7] * knots
+        assert list(delta[16 * dof : 16 * dof + 16]) == expected + [-7] * (16 - knots)
+        assert changed[dof] == (SIGNAL[dof] and any(differences))
+    assert count == sum(changed)
 
 
 @given(
@@ -122,19 +125,25 @@ def test_change_at_the_knots_stays_what_it_is_at_the_last_one_known(after, befor
     st.lists(integers(-ONE, ONE), min_size=48, max_size=48),
     st.integers(0, 9),
     st.integers(0, 3),
+    integers(0, 9),
+    integers(1, 16),
 )
-def test_rings_follow_a_change_from_knot_to_knot(frame, count, deltas, seed, first_dof):
+def test_rings_follow_a_change_from_knot_to_knot(frame, count, deltas, seed, first_dof, first_knot, knots):
+    first_knot = min(first_knot, knots - 1)
     base, third = rings(seed), rings(seed + 10)
     rows = base[:], third[:]
     delta = words(number + 65536 for number in deltas)
-    MODULE.bend(base, third, ROW, 3, SIGNAL, first_dof, frame, frame + count, bytes(KNOTS), delta)
+    MODULE.bend(
+        base, third, ROW, 3, SIGNAL, first_dof, frame, frame + count, bytes(KNOTS[:knots]), first_knot, knots, delta
+    )
+    first = KNOTS[first_knot]
     for dof in range(3):
-        change = numpy.interp(numpy.arange(RING), KNOTS, deltas[16 * dof : 16 * dof + 16])
+        change = numpy.interp(numpy.arange(RING), KNOTS[:knots], deltas[16 * dof : 16 * dof + knots])
         for after, before in zip((base, third), rows, strict=True):
             expected = numpy.array(row_of(before, dof), float)
             if SIGNAL[dof] and dof >= first_dof:
-                places = numpy.arange(frame, frame + count) % RING
-                expected[places] = numpy.clip(expected[places] + change[:count], 0, ONE)
+                places = numpy.arange(frame + first, frame + count) % RING
+                expected[places] = numpy.clip(expected[places] + change[first:count], 0, ONE)
                 # Half a unit; and a slope is cut off at 2^-8, which comes to 92 of these between the last knots.
                 errors = numpy.abs(numpy.array(row_of(after, dof))[places] - expected[places])
                 assert numpy.all(errors <= 0.5 + 92 / 256)

@@ -133,13 +133,38 @@ def test_offset_dies_out_critically_damped(rate_hz):
     assert (both[0], both[16]) == (ZERO_Q20, ZERO_Q20)
 
 
-@given(st.lists(st.tuples(*[integers(-(1 << 24), 1 << 24)] * 2, offsets_q20), min_size=3, max_size=3))
-def test_offset_takes_up_what_the_correction_has_lost(entries):
-    before, after, offsets = (words(number + ZERO_Q20 for number in column) for column in zip(*entries, strict=True))
-    MODULE._step(3, SIGNAL, before, after, offsets)
-    expected = [int(numpy.clip(off + was - now, -MOST_Q20, MOST_Q20)) for was, now, off in entries]
-    expected[1] = entries[1][2]
-    assert [offset - ZERO_Q20 for offset in offsets] == expected
+@given(
+    st.lists(st.tuples(*[integers(-(1 << 23), 1 << 23)] * 2, offsets_q20, offsets_q20), min_size=3, max_size=3),
+    st.sampled_from([10, 30, 60]),
+    integers(0, 3),
+)
+def test_offset_takes_up_what_the_correction_has_lost(entries, rate_hz, age):
+    processing = MODULE.SignalProcessing()
+    processing.load(rate_hz)
+    left, lost = processing._left_q15[age], processing._lost_q15[age]
+    before, after, offsets, rates = (
+        words(number + ZERO_Q20 for number in column) for column in zip(*entries, strict=True)
+    )
+    both = words([*offsets, *[-7] * 13, *rates, *[-7] * 13])
+    MODULE._step(3, SIGNAL, before, after, left, lost, both)
+    for dof, (was, now, off, rate) in enumerate(entries):
+        e, v = (both[dof] - ZERO_Q20, both[16 + dof] - ZERO_Q20)
+        if SIGNAL[dof]:
+            assert abs(e - numpy.clip(off + (was - now) * left / 32768, -MOST_Q20, MOST_Q20)) <= (0 if age == 0 else 2)
+            assert abs(v - (rate - (was - now) * lost / 32768)) <= (0 if age == 0 else 2)
+        else:
+            assert (e, v) == (off, rate)
+
+
+@pytest.mark.parametrize("rate_hz", [10, 30, 60])
+def test_offset_that_begins_late_is_what_it_would_be_by_then(rate_hz):
+    """`e = (1 + t / tau) exp(-t / tau)` and `v = -t / tau^2 exp(-t / tau)`, up to three frames after the news."""
+    processing = MODULE.SignalProcessing()
+    processing.load(rate_hz)
+    for age in range(4):
+        t = age / rate_hz / 0.15
+        assert abs(processing._left_q15[age] / 32768 - (1 + t) * math.exp(-t)) < 1 / 1000
+        assert abs(processing._lost_q15[age] / 32768 - t * math.exp(-t) / (0.15 * rate_hz)) < 1 / 1000
 
 
 def test_bypass_lets_the_base_through_and_forgets_offsets():

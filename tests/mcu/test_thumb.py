@@ -65,9 +65,11 @@ for k in range(20):
     frame = draw(2000)
     end = frame + (0, 1, 254, 271)[k] if k < 4 else frame + draw(272)
     first = draw(3)
+    count = 1 + draw(16)
+    knot = draw(count)
     for step in range(2):
-        bands.bend(ring, third, row, 3, signal, first, frame, end, knots, delta)
-        bands_thumb.bend(one, two, row, 3, signal, first, frame, end, knots, delta)
+        bands.bend(ring, third, row, 3, signal, first, frame, end, knots, knot, count, delta)
+        bands_thumb.bend(one, two, row, 3, signal, first, frame, end, knots, knot, count, delta)
     bad += not (same(ring, one) and same(third, two))
 print(bad, min(ring) == 0 and max(ring) == 32768)
 """

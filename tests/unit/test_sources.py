@@ -73,6 +73,9 @@ CONSTANTS = [
     ("blinks", "_RTRIGSIN", formats.FUNCTION_RTRIGSIN),
     ("actions", "_ENTRY_START", formats.ENTRY_START),
     ("exchange", "_NEW", formats.NEW),
+    ("future", "_NEW", formats.NEW),
+    ("future", "_DOFS", formats.DOFS_MAX),
+    ("future", "_ZERO_Q16", 1 << 20),  # bands.ZERO_Q16
     ("trajectory", "_DOFS", formats.DOFS_MAX),
     ("trajectory", "_ONE", formats.POSITION_ONE),
     ("character", "_TERMS", len(messages.find(messages.CHARACTER)[2]) - 1),
