@@ -377,7 +377,7 @@ class Future:
             self._compute_some(tables, puppet)
         elif stage == _SPLIT:
             if self._has_changed:
-                self._levels(tables, self._frame - 1)
+                self._levels(tables, self._news)
                 puppet.processing.follow(tables, self.level_q16, self._frame - 1 - self._news)
             self._levels(tables, self._frame)
             self._stage = _DONE
@@ -452,6 +452,7 @@ class Future:
             self._weigh(tables, self._outlook.playing, self._outlook.found)
             self._front = frame
             self._news = frame - 1
+            puppet.processing.note(tables)
             self._has_changed = True
             us -= self._news_us(tables)
         us += self._left_us - _ENTER_US * puppet.entered

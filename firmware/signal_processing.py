@@ -21,7 +21,7 @@ _DOFS = const(16)
 _ZERO = const(0x10000000)
 _GAIN_MS = const(250)  # time constant of the gains
 _OFFSET_MS = const(150)  # of the offset
-_AGES = const(4)  # of news, for which offsets allow
+_AGES = const(64)  # frames after news for which offsets allow
 
 
 @micropython.viper
@@ -122,27 +122,44 @@ def _step(
     after_q20: ptr32,
     left_q15: int,
     lost_q15: int,
+    step_q20: ptr32,
     offset_q20: ptr32,
 ):
-    """Add to every `e` what `corr` has lost, times `left`, and subtract it times `lost` from `v / F`; `e` stays within 16.
+    """Let `step` be what `corr` has lost by the news; add to every `e` what is `left` of that by now, and to `v / F` that it `lost`.
 
-    Bits: `corr` is within 16, 2^24; limbs of 13 + 12 bits times 15.
+    What `step` was before has been added already. `e` stays within 16. Bits: `corr` is within 16, 2^24; limbs of 14 + 12 bits
+    times 15.
     """
     d = 0
     while d < dofs:
         if signal[d]:
             step = before_q20[d] - after_q20[d]
-            off = offset_q20[d] - _ZERO + ((step >> 12) * left_q15 >> 3) + ((step & 0xFFF) * left_q15 >> 15)
+            more = step - (step_q20[d] - _ZERO)
+            step_q20[d] = step + _ZERO
+            off = offset_q20[d] - _ZERO + ((more >> 12) * left_q15 >> 3) + ((more & 0xFFF) * left_q15 >> 15)
             if off > 0xFFFFFF:
                 off = 0xFFFFFF
             if off < -0xFFFFFF:
                 off = -0xFFFFFF
             offset_q20[d] = off + _ZERO
-            if lost_q15:
-                rate = offset_q20[_DOFS + d] - _ZERO
-                rate -= ((step >> 12) * lost_q15 >> 3) + ((step & 0xFFF) * lost_q15 >> 15)
-                offset_q20[_DOFS + d] = rate + _ZERO
+            rate = offset_q20[_DOFS + d] - _ZERO
+            rate -= ((more >> 12) * lost_q15 >> 3) + ((more & 0xFFF) * lost_q15 >> 15)
+            offset_q20[_DOFS + d] = rate + _ZERO
         d += 1
+
+
+@micropython.viper
+def _note(dofs: int, corr_q20: ptr32, news_q20: ptr32, step_q20: ptr32, bands: int, gain4_q16: ptr32, news4_q16: ptr32):
+    """Keep a frame's `corr` and gains; no step has been added yet."""
+    d = 0
+    while d < dofs:
+        news_q20[d] = corr_q20[d]
+        step_q20[d] = _ZERO
+        d += 1
+    k = 0
+    while k < bands:
+        news4_q16[k] = gain4_q16[k]
+        k += 1
 
 
 @micropython.viper
@@ -164,6 +181,10 @@ class SignalProcessing:
         self.gain4_q16 = words(BANDS)
         self._corr_q20 = words(DOFS_MAX)
         self._after_q20 = words(DOFS_MAX)
+        self._news_q20 = words(DOFS_MAX)  # `corr` of the last frame with news, from what was foreseen then
+        self._step_q20 = words(DOFS_MAX)  # what it lost by them, as far as that is known
+        self._news4_q16 = words(BANDS)  # the gains of that frame
+        self._is_noted = False
         self._is_active = False
         self._offset_q20 = words(2 * DOFS_MAX)
         self._alpha_q15 = self._keep_q15 = self._share_q15 = 0
@@ -186,7 +207,7 @@ class SignalProcessing:
 
     def rest(self):
         """Set what holds before frame 0: all gains 1, no offsets."""
-        self._is_active = False
+        self._is_active = self._is_noted = False
         for band in range(BANDS):
             self.target4_q16[band] = self.gain4_q16[band] = GAIN4_ONE
         for place in range(2 * DOFS_MAX):
@@ -205,7 +226,7 @@ class SignalProcessing:
         """Compute the signal of a frame from its base, and from its levels as they were foreseen; return how many were clipped.
 
         If something has arrived, the levels are others, but `e` takes up the difference: the signal of this frame is the same.
-        `follow` is called when they are known.
+        `note` is called then, and `follow` when they are known.
         """
         self._is_active = True
         # fmt: off
@@ -218,21 +239,29 @@ class SignalProcessing:
 
     def bypass(self, tables, base_q15, signal_q15):
         """Let the signal be the base, as it is with all gains 1."""
-        self._is_active = False
+        self._is_active = self._is_noted = False
         _pass(tables.dofs, base_q15, self._offset_q20, signal_q15)
 
-    def follow(self, tables, level_q16, age):
-        """Let the offsets take up what the levels of the last frame have become, from what `process` took them for.
-
-        `age` is how many frames before that the news came: offsets are what they would be had they begun then, as long as
-        that makes no step worth speaking of.
-        """
-        if self._is_active:
-            age = min(age, _AGES - 1)
+    def note(self, tables):
+        """Note that the last frame had news: `corr` is what it was foreseen to be."""
+        self._is_noted = self._is_active
+        if self._is_noted:
             # fmt: off
-            _correct(tables.dofs, tables.signal, level_q16, self.gain4_q16, GAIN4_ONE, self._after_q20)
+            _note(
+                tables.dofs, self._corr_q20, self._news_q20, self._step_q20, BANDS, self.gain4_q16, self._news4_q16
+            )
+            # fmt: on
+
+    def follow(self, tables, level_q16, age):
+        """Let the offsets take up the step of `corr` in the frame with the last news, whose levels are known now, or better now.
+
+        That was `age` frames before the last one: what the offsets would be by now is added.
+        """
+        if self._is_noted and age < _AGES:
+            # fmt: off
+            _correct(tables.dofs, tables.signal, level_q16, self._news4_q16, GAIN4_ONE, self._after_q20)
             _step(
-                tables.dofs, tables.signal, self._corr_q20, self._after_q20, self._left_q15[age], self._lost_q15[age],
-                self._offset_q20,
+                tables.dofs, tables.signal, self._news_q20, self._after_q20, self._left_q15[age], self._lost_q15[age],
+                self._step_q20, self._offset_q20,
             )
             # fmt: on
