@@ -184,8 +184,8 @@ def bend(
 ):
     """Let both rings follow a change, straight from knot to knot, from `first_knot` to before frame `end`.
 
-    Knots are counted from `frame`, DOFs are those from `first_dof` to before `dofs`; behind the last knot the change stays. Bits: a
-    change and its slope have 8 binary places more, 2^24.
+    Knots are counted from `frame`, DOFs are those from `first_dof` to before `dofs`; behind the last knot the change stays.
+    Bits: a change and its slope have 8 binary places more, 2^24.
     """
     last = knots - 1
     d = first_dof

@@ -43,7 +43,8 @@ class Puppet:
 
     `frame` is the number of the next frame, -1 while the motion does not run. `base_q15` and `signal_q15` hold the last
     frame's values per DOF, after the compositor and after signal processing; `motor.motor_q15` what the motors were
-    told. `entered` is how many actions have entered in the last frame, `clipped` counts the values that signal processing has clipped at the ends of their range since `start`.
+    told. `entered` is how many actions have entered in the last frame. `clipped` counts the values that signal processing has
+    clipped at the ends of their range since `start`.
     """
 
     def __init__(self, board):

@@ -133,38 +133,52 @@ def test_offset_dies_out_critically_damped(rate_hz):
     assert (both[0], both[16]) == (ZERO_Q20, ZERO_Q20)
 
 
+corrections_q20 = integers(-(1 << 23), 1 << 23)
+
+
 @given(
-    st.lists(st.tuples(*[integers(-(1 << 23), 1 << 23)] * 2, offsets_q20, offsets_q20), min_size=3, max_size=3),
+    st.lists(st.tuples(*[corrections_q20] * 3, offsets_q20, offsets_q20), min_size=3, max_size=3),
     st.sampled_from([10, 30, 60]),
-    integers(0, 3),
+    integers(0, 63, 1),
 )
 def test_offset_takes_up_what_the_correction_has_lost(entries, rate_hz, age):
+    """Entries are `corr` as it was foreseen and is, the step that has been added already, `e` and `v / F`."""
     processing = MODULE.SignalProcessing()
     processing.load(rate_hz)
     left, lost = processing._left_q15[age], processing._lost_q15[age]
-    before, after, offsets, rates = (
+    before, after, steps, offsets, rates = (
         words(number + ZERO_Q20 for number in column) for column in zip(*entries, strict=True)
     )
     both = words([*offsets, *[-7] * 13, *rates, *[-7] * 13])
-    MODULE._step(3, SIGNAL, before, after, left, lost, both)
-    for dof, (was, now, off, rate) in enumerate(entries):
-        e, v = (both[dof] - ZERO_Q20, both[16 + dof] - ZERO_Q20)
+    MODULE._step(3, SIGNAL, before, after, left, lost, steps, both)
+    tolerance = 2 if age else 0
+    for dof, (was, now, step, off, rate) in enumerate(entries):
+        e, v = both[dof] - ZERO_Q20, both[16 + dof] - ZERO_Q20
         if SIGNAL[dof]:
-            assert abs(e - numpy.clip(off + (was - now) * left / 32768, -MOST_Q20, MOST_Q20)) <= (0 if age == 0 else 2)
-            assert abs(v - (rate - (was - now) * lost / 32768)) <= (0 if age == 0 else 2)
+            more = was - now - step
+            assert abs(e - numpy.clip(off + more * left / 32768, -MOST_Q20, MOST_Q20)) <= tolerance
+            assert abs(v - (rate - more * lost / 32768)) <= tolerance
+            assert steps[dof] - ZERO_Q20 == was - now
         else:
-            assert (e, v) == (off, rate)
+            assert (e, v, steps[dof] - ZERO_Q20) == (off, rate, step)
+
+
+def test_news_find_the_correction_and_the_gains_of_their_frame():
+    news, steps, gains = words([-7] * 4), words([-7] * 4), words([-7] * 8)
+    MODULE._note(3, words([5, 6, 7, 8]), news, steps, 7, words(range(20, 28)), gains)
+    assert (list(news), list(steps)) == ([5, 6, 7, -7], [ZERO_Q20] * 3 + [-7])
+    assert list(gains) == [20, 21, 22, 23, 24, 25, 26, -7]
 
 
 @pytest.mark.parametrize("rate_hz", [10, 30, 60])
 def test_offset_that_begins_late_is_what_it_would_be_by_then(rate_hz):
-    """`e = (1 + t / tau) exp(-t / tau)` and `v = -t / tau^2 exp(-t / tau)`, up to three frames after the news."""
+    """`e = (1 + t / tau) exp(-t / tau)` and `v = -t / tau^2 exp(-t / tau)`, up to 63 frames after the news."""
     processing = MODULE.SignalProcessing()
     processing.load(rate_hz)
-    for age in range(4):
+    for age in range(64):
         t = age / rate_hz / 0.15
-        assert abs(processing._left_q15[age] / 32768 - (1 + t) * math.exp(-t)) < 1 / 1000
-        assert abs(processing._lost_q15[age] / 32768 - t * math.exp(-t) / (0.15 * rate_hz)) < 1 / 1000
+        assert abs(processing._left_q15[age] / 32768 - (1 + t) * math.exp(-t)) < 1 / 500
+        assert abs(processing._lost_q15[age] / 32768 - t * math.exp(-t) / (0.15 * rate_hz)) < 1 / 500
 
 
 def test_bypass_lets_the_base_through_and_forgets_offsets():

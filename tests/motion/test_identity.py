@@ -116,6 +116,8 @@ def test_renderings_are_identical_to_the_bit_on_all_mcus(played, number):
     renderings = played[number].result().renderings
     late = [rendering.status["late_frames"] for rendering in renderings.values()]
     assert not any(late), "the motor layer had to guess"
+    cut_short = [rendering.status["cut_short"] for rendering in renderings.values()]
+    assert not any(cut_short), "there was no time for the future"
     for name in TAPS:
         expected = tap(renderings["unix"], name)
         for kind in ("reference", "unix32", "rp2040"):

@@ -73,9 +73,9 @@ CONSTANTS = [
     ("blinks", "_RTRIGSIN", formats.FUNCTION_RTRIGSIN),
     ("actions", "_ENTRY_START", formats.ENTRY_START),
     ("exchange", "_NEW", formats.NEW),
-    ("future", "_NEW", formats.NEW),
-    ("future", "_DOFS", formats.DOFS_MAX),
-    ("future", "_ZERO_Q16", 1 << 20),  # bands.ZERO_Q16
+    ("rings", "_NEW", formats.NEW),
+    ("rings", "_DOFS", formats.DOFS_MAX),
+    ("rings", "_ZERO_Q16", 1 << 20),  # bands.ZERO_Q16
     ("trajectory", "_DOFS", formats.DOFS_MAX),
     ("trajectory", "_ONE", formats.POSITION_ONE),
     ("character", "_TERMS", len(messages.find(messages.CHARACTER)[2]) - 1),
@@ -89,7 +89,7 @@ CONSTANTS = [
     ("foresight", "_CONST", formats.FUNCTION_CONST),
     *((module, "_LIVE", formats.FUNCTION_LIVE) for module in ("foresight", "foresight_thumb")),
     *((module, "_CURVE", formats.FUNCTION_CURVE) for module in ("foresight", "foresight_thumb")),
-    *((module, "_PROGRAM", formats.FUNCTION_PROGRAM) for module in ("foresight", "foresight_thumb", "future")),
+    *((module, "_PROGRAM", formats.FUNCTION_PROGRAM) for module in ("foresight", "foresight_thumb", "budget")),
     *((module, "_DOFS", formats.DOFS_MAX) for module in ("bands", "bands_thumb", "signal_processing")),
     *((module, "_ZERO", 1 << 20) for module in ("bands", "bands_thumb")),  # bands.ZERO_Q16
     *((module, "_DELTA_ZERO", 1 << 16) for module in ("bands", "bands_thumb")),
