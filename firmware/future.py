@@ -330,10 +330,10 @@ class Future:
         """Return how many frames are to be computed at once, -1 if rings are to be bent first, 0 if nothing is left to do."""
         until = self._frame + _FAR
         if self._is_bending:
+            if self._is_first or self._us > budget.BEND_US * _BEND_DOFS:
+                return -1
             until = self._origin + _NEAR_FRAMES
-            if self._front >= until:
-                return -1 if self._is_first or self._us > budget.BEND_US * _BEND_DOFS else 0
-        elif self._front >= self._frame + _AHEAD:
+        if self._front >= min(until, self._frame + _AHEAD):
             return 0
         return min(until - self._front, max(self._budget.frames(self._us), 1 if self._is_first else 0))
 
