@@ -41,7 +41,7 @@ _FRAME_ACTION_NS = const(12000)
 _FRAME_MAPPING_NS = const(200)
 _FRAME_WORD_NS = const(500)
 _FRAME_LIVE_NS = const(1000)
-_PORTION_US = const(4000)  # that is done at once, between looks at what has come
+_PORTION_US = const(3500)  # that is done at once, between looks at what has come
 
 
 @micropython.viper

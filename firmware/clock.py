@@ -33,13 +33,14 @@ def ticks_diff(later, earlier):
 class FrameClock:
     """Tells when frames are due; measures how late they were begun.
 
-    `rate_hz` is the frame rate, 10..60. `late_max_us` is how late a frame was begun at most since `start`.
+    `rate_hz` is the frame rate, 10..60. `late_us` is how late the last frame was begun, `late_max_us` how late one was at most since
+    `start`.
     """
 
     def __init__(self):
         self.rate_hz = 30
         self.due_us = 0
-        self.late_max_us = 0
+        self.late_us = self.late_max_us = 0
         self._remainder = 0
         self._is_held = False
 
@@ -65,6 +66,7 @@ class FrameClock:
     def begin(self, now_us):
         """Note the lateness of the frame that begins now, and set the instant at which the next one is due."""
         late_us = ticks_diff(now_us, self.due_us)
+        self.late_us = late_us
         if late_us > self.late_max_us:
             self.late_max_us = late_us
         rate_hz = self.rate_hz

@@ -125,8 +125,6 @@ class Exchange:
         puppet = self._puppet
         scratch = self._scratch
         a = puppet.actions
-        if not puppet.future.is_sketched:
-            puppet.future.sketch_before(old, puppet)
         puppet.future.exchange(old, new, puppet, scratch)
         keep = new.keep_action
         count = new.actions

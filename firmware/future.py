@@ -36,6 +36,7 @@ _PAST = const(255)
 _FAR = const(271)
 _BEND_DOFS = const(6)  # that one portion bends
 
+_SKETCH_MOST_US = const(2500)  # that a sketch in a frame may take
 _START_US = const(160000)  # that may be spent on the future of frame 0
 
 _BEGIN = const(0)  # stages of work
@@ -133,22 +134,29 @@ class Future:
         return self._is_exchanged
 
     def before_news(self, tables, puppet):
-        """Note what is to be expected before anything that arrives in this frame has acted, if that has not been done in time."""
+        """See that it is noted what is to be expected, before anything that arrives in this frame acts.
+
+        Where that has not been done between frames, it is done now if the frame does not come too late by that.
+        """
         if self._is_idle:
             return
         if not self.is_sketched:
-            self.sketch_before(tables, puppet)
+            if self._budget.sketch_us < _SKETCH_MOST_US - puppet.clock.late_us:
+                self.sketch_before(tables, puppet)
+            else:
+                self._is_sketchy = False
+                self.cut_short += 1
         self._has_news = True
         self._is_exchanged = False
 
     def sketch_before(self, tables, puppet):
-        """Note what is to be expected if nothing arrives, from the frame that comes next on."""
+        """Note what is to be expected if nothing arrives, from the frame that comes next on, if a sketch is worth its time."""
         a = puppet.actions
         a.compute_phases(tables, puppet.master, tables.frame_rate_hz)  # which lists who plays
         self._budget.weigh(tables, a.playing, a.found)
         while self._is_bending:
             self._bend_far(tables)
-        self._is_sketchy = self._budget.news_us(tables) + self._budget.sketch_us < self._budget.left_us
+        self._is_sketchy = self._budget.sketch_us + self._budget.news_us(tables) < self._budget.left_us
         if self._is_sketchy:
             self._sketch(tables, puppet, False)
             _copy_halves(self._foresight.future_q15, self._before_q15, tables.dofs * BLOCK)
@@ -177,6 +185,8 @@ class Future:
             self._frame += 1
             self.is_sketched = False
             return
+        if self.is_sketched:  # the outlook has been overwritten by that, whatever came of it
+            self._has_news = True
         if self._has_news:
             self._recall(tables, 0)
             _copy_halves(base_q15, self._base_column_q15, tables.dofs)
@@ -184,7 +194,7 @@ class Future:
             self._rings.write(tables, self._frame, base_q15)
         self._frame += 1
         self._stage = _BEGIN
-        self._has_changed = self.is_sketched = False
+        self.is_sketched = False
         self.pending = True
 
     # --- between frames
@@ -201,16 +211,37 @@ class Future:
             self._compute_some(tables, puppet)
         elif stage == _SPLIT:
             if self._has_changed:
+                self._has_changed = False
                 self._rings.split(tables, self._news)
                 puppet.processing.follow(tables, self.level_q16, self._frame - 1 - self._news)
             self._rings.split(tables, self._frame)
             self._stage = _DONE
-            if puppet.cues.has_news(self._frame) and self._frame:
+            if self._frame and puppet.expects_news():
                 self._stage = _SKETCH
         else:
             self.sketch_before(tables, puppet)
             self._stage = _DONE
         self.pending = self._stage != _DONE
+        return self.pending
+
+    def need_us(self):
+        """Return about how long the next step of `work` takes."""
+        stage = self._stage
+        if stage == _SKETCH or (stage == _BEGIN and self._has_news and self._is_sketchy):
+            return self._budget.sketch_us
+        if stage == _NEAR:
+            return budget.NEAR_US * self._changes
+        if stage == _COMPUTE:
+            frames = self._wanted()
+            if frames:
+                return self._budget.block_us + frames * self._budget.frame_us if frames > 0 else budget.BEND_US * _BEND_DOFS
+        return 0
+
+    def expect_news(self):
+        """Note that the next frame will have news, behind all work; return whether there is more of that now."""
+        if self._frame and not (self._is_idle or self.is_sketched or self.pending):
+            self._stage = _SKETCH
+            self.pending = True
         return self.pending
 
     def relent(self):
@@ -224,16 +255,14 @@ class Future:
         That happens only if the link or the motor layer take more time than is allowed for here. Other MCUs may then compute
         other signals; but the frame is in time.
         """
-        is_cut = False
         if self._stage == _BEGIN:
             self._is_sketchy = False
             self._begin(tables, puppet)
-            is_cut = True
+        is_cut = False
         if self._stage != _SKETCH:
-            is_cut = is_cut or self._stage == _NEAR or (self._stage == _COMPUTE and self._wanted() != 0)
-            self._stage = _SPLIT
-            self.work(tables, puppet)
-        if self._stage == _SKETCH:
+            is_cut = self._has_changed or self._stage == _NEAR or (self._stage == _COMPUTE and self._wanted() != 0)
+            self._rings.split(tables, self._frame)
+        if self._stage == _SKETCH or (self._frame and puppet.expects_news()):
             self._is_sketchy = False
             self.is_sketched = is_cut = True
         self._stage = _DONE
@@ -273,7 +302,7 @@ class Future:
             self._has_changed = True
             us -= self._budget.news_us(tables)
         us += self._budget.left_us - budget.ENTER_US * puppet.entered
-        if puppet.cues.has_news(frame):
+        if puppet.expects_news():
             us -= self._budget.sketch_us
         self._us = us
         self._is_first = not self._has_changed

@@ -33,9 +33,9 @@ from shared.formats import (
 )
 
 _COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
-_SHORT_US = const(2000)  # of work, behind which there is time for more before the main loop has its turn
+_SHORT_US = const(1500)  # of work, behind which there is time for more before the main loop has its turn
 _CARRY_US = const(21000)  # what putting other tables into force takes
-_MARGIN_US = const(3000)  # between the end of a frame and what is done then
+_MARGIN_US = const(6000)  # between the end of a frame and what is done then
 
 
 class Puppet:
@@ -92,9 +92,11 @@ class Puppet:
         self.hold_state = (self._hold_target_q28, self._hold_x_q28, self._hold_w_q28)
         self.exchange = Exchange(self)
         self._exchange_due = False
+        self._exchange_due_in = -1  # the frame before which it is, once that has been prepared for
         self._tempos_changed = 0
         self._is_starting = False
         self._rehearsed = 0
+        self._arrivals = 0  # of cues, as far as they have been looked at
 
     def commit(self):
         """Let the staged tables, which are complete, replace those that play: now, or when the motion runs, soon."""
@@ -144,18 +146,12 @@ class Puppet:
         future are left out. The last steps collect what tables leave on the heap, so that it does not fill up in the middle of a
         frame, note what is to be expected, and put the new tables into force. They wait until there is time for that.
         """
-        if self.future.pending:
+        if self.future.pending or self._has_heard():
             micropython.heap_lock()  # as in a frame
             try:
-                if self._exchange_due:
-                    self.future.relent()
-                begun_us = self._board.ticks_us()
-                while self.future.work(self.tables, self):
-                    if clock.ticks_diff(self._board.ticks_us(), begun_us) > _SHORT_US:
-                        break
+                return self._work()
             finally:
                 micropython.heap_unlock()
-            return True
         if self._is_starting:
             self._is_starting = False
             self.clock.start(self.motor.start(), self.tables.frame_rate_hz)
@@ -163,16 +159,50 @@ class Puppet:
         if self.exchange.step < 0:
             return False
         if self._exchange_due:
-            if not self._has_time(_CARRY_US):
+            if self._exchange_due_in == self.frame:
+                self._exchange_due = False
+                self.exchange.carry_over()
+                self._tempos_changed = 1
+            elif self._has_time(_CARRY_US):
+                self._expect()
+                self._exchange_due_in = self.frame
+            else:
                 return False
-            self._exchange_due = False
-            self.exchange.carry_over()
-            self._tempos_changed = 1
         elif self.exchange.prepare():
             if not self._has_time(_COLLECT_US):
                 return False
             gc.collect()
             self._exchange_due = True
+        return True
+
+    def _expect(self):
+        """Note what is to be expected from the next frame on, as it is without other tables."""
+        if not self.future.is_sketched:
+            micropython.heap_lock()
+            try:
+                self.future.sketch_before(self.tables, self)
+            finally:
+                micropython.heap_unlock()
+
+    def _has_heard(self):
+        """Return whether news for the next frame have come behind all work for it: what is to be expected is noted then."""
+        if self.cues.arrivals == self._arrivals or self.frame < 0:
+            return False
+        self._arrivals = self.cues.arrivals
+        return self.expects_news() and self.future.expect_news()
+
+    def _work(self):
+        """Work for a while; return whether there was time for that: a step that would make the next frame late is left to it."""
+        future = self.future
+        if self.exchange.step >= 0:
+            future.relent()
+        begun_us = now_us = self._board.ticks_us()
+        while clock.ticks_diff(now_us, begun_us) <= _SHORT_US:
+            if self.clock.until_us(now_us) < future.need_us() >> 1:
+                return False
+            if not future.work(self.tables, self):
+                break
+            now_us = self._board.ticks_us()
         return True
 
     def _has_time(self, need_us):
@@ -208,7 +238,11 @@ class Puppet:
                 return False
             self.future.correct_start(self.tables)
             return True
-        return self.future.has_news() or self.cues.has_news(self.frame) or self.kalman.is_moving(self.tables.lives)
+        return self.future.has_news() or self.expects_news()
+
+    def expects_news(self):
+        """Return whether something is at hand that changes in the next frame, or the one under way, what is to come."""
+        return self.cues.has_news(self.frame) or self.kalman.is_moving(self.tables.lives)
 
     # fmt: off
     def _synthesise(self, is_rehearsal):

@@ -10,7 +10,7 @@ PROTOCOL counts changes of meaning; the checksum of this dictionary catches chan
 exchanged by `hello` and `welcome`, whose layout, with that of `ack`, never changes.
 """
 
-PROTOCOL = 4  # not 3: a greeting that comes while the firmware starts would have Ctrl-C in it
+PROTOCOL = 6  # 1 to 5 are control characters of MicroPython's REPL: a greeting must not interrupt or restart what it meets
 
 HELLO = 0x10
 PING = 0x11

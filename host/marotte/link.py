@@ -39,6 +39,8 @@ is more than what an MCU that plays is busy with otherwise.
 HURRY_US = 5_000
 """A gap that the MCU reports is filled at once, but not twice within this: all that follow it report it too."""
 
+CTRL_C = 3
+
 SILENT_US = 1_000_000
 """With commands under way and no packet, or no answer to any of them, for so long, the MCU counts as gone."""
 
@@ -288,8 +290,12 @@ class Link:
     def _send(self, command: _Command) -> None:
         if not self._under_way:  # silence begins with the first command that waits for an answer
             self.heard_us = self._answered_us = self._carrier.now_us()
+        message_id = _BY_NAME[command.name][1]
+        command.packet = wire_packet(message_id, self._seq, command.payload)
+        while command.name == "hello" and CTRL_C in command.packet:  # it may meet MicroPython's start, and would end it
+            self._seq = (self._seq + 1) & 255
+            command.packet = wire_packet(message_id, self._seq, command.payload)
         command.seq = self._seq
-        command.packet = wire_packet(_BY_NAME[command.name][1], command.seq, command.payload)
         command.sent_us = self._carrier.now_us()
         self._seq = (self._seq + 1) & 255
         self._under_way.append(command)
