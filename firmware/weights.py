@@ -188,7 +188,7 @@ def sketch(
                 part = int(strides[b])
                 power = int(power_q15[b])
                 if power:
-                    w = ((w + ((((part * ((a + 0x400) >> 11)) >> 6) * x) >> 9)) * power + 0x4000) >> 15
+                    w = ((w + ((((part * ((a + 0x400) >> 11)) >> 6) * x + 0x100) >> 9)) * power + 0x4000) >> 15
                     x = (x * power + 0x4000) >> 15
                 else:
                     x = 0
@@ -224,7 +224,7 @@ def sketch(
                         square = (square * square + 0x4000) >> 15
                         k = k >> 1
                 if power:
-                    w = ((w + ((((part * ((a + 0x400) >> 11)) >> 6) * x) >> 9)) * power + 0x4000) >> 15
+                    w = ((w + ((((part * ((a + 0x400) >> 11)) >> 6) * x + 0x100) >> 9)) * power + 0x4000) >> 15
                     x = (x * power + 0x4000) >> 15
                 else:
                     x = 0

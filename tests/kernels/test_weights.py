@@ -190,6 +190,7 @@ def futures(draw):
 @example(((0, 0, WEIGHT_MAX, 111_000, 111_000), NEVER, 0), STRIDES)
 @example(((WEIGHT_MAX, 0, 790759356, 130503, 130503), 74, VALUE_ONE >> 2), STRIDES)
 @example(((0, WEIGHT_MAX, WEIGHT_MAX, 4_000_000, 4_000_000), NEVER, 0), STRIDES)
+@example(((1048576, 1048575, 1048575, 31744, 1), NEVER, 0), (1, 1, 1, 1, 1, 2, 2, 4, 4, 8, 8, 16, 24, 36, 54, 92))
 def test_weights_far_ahead_are_those_of_the_filters(future, strides):
     entry, turn, turned_q13 = future
     (course,), (peak,) = sketch([entry], [turn], turned_q13, strides)
