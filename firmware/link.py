@@ -58,7 +58,8 @@ def _collect(chunk: ptr8, start: int, end: int, wire: ptr8, length: int, room: i
 class Link:
     """Receives and answers for one puppet.
 
-    `packets` and `damaged` count what came, `is_behind` tells that more may have come than `poll` has taken. `commands`,
+    `packets` and `damaged` count what came, `is_behind` tells that more may have come than `poll` has taken,
+    `has_heard` that it has taken anything since that was set to False. `commands`,
     `telemetry` and `store` are its parts. A packet to send is put into `out`, two bytes of head first, and sent by `send`.
     """
 
@@ -66,6 +67,7 @@ class Link:
         self.packets = 0
         self.damaged = 0
         self.is_behind = False
+        self.has_heard = False
         self._has_paused = False
         self.out = bytearray(codec.BODY_MAX)
         self.telemetry = Telemetry(board, puppet, self)
@@ -108,6 +110,7 @@ class Link:
         if end == 0:
             self._has_paused = True
             return False
+        self.has_heard = True
         # Only where the line was seen to be still: the main loop itself may have been away for longer.
         if self._length and self._has_paused and ticks_diff(now_us, self._byte_us) > _STALE_US:
             self._length = 0

@@ -16,7 +16,7 @@ from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
 _CHUNKS = 5  # of bytes that are taken in one pass: all that a host has under way, and a kill
-_BEHIND_MAX = 2  # passes in a row that take what has come, before there is work between frames again
+_BUSY_MAX = 2  # passes in a row that take what has come, before there is work between frames again
 _OVERDUE_US = 20000  # a frame that is so late waits for what has come, as a kill may be among it
 _WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board
 
@@ -39,6 +39,7 @@ def _pass(board, puppet, link):
     MicroPython then keeps the locals of larger functions on the stack, instead of looking through the heap for room, which costs
     200 us a call once it is half full.
     """
+    link.has_heard = False
     if not _take(board, puppet, link):
         return None
     if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0:
@@ -72,12 +73,12 @@ def perform(board, room=None):
         if puppet.frame >= 0:
             puppet.start()  # again, as reading and collecting have taken their time
         board.watchdog(_WATCHDOG_MS)
-        longest_us = behind = 0
+        longest_us = busy = 0
         while longest_us is not None:
-            if link.is_behind and behind < _BEHIND_MAX:
-                behind += 1  # a kill may be among what has come
+            if link.has_heard and busy < _BUSY_MAX:
+                busy += 1  # more may have come meanwhile, and a kill may be among it
             elif longest_us > 0:
-                behind = 0
+                busy = 0
                 if not puppet.prepare():
                     board.wait(longest_us)
             micropython.heap_lock()

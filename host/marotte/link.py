@@ -40,6 +40,9 @@ HURRY_US = 5_000
 """A gap that the MCU reports is filled at once, but not twice within this: all that follow it report it too."""
 
 CTRL_C = 3
+CTRL_D = 4
+_ERASERS = b"\x03\x08\x0b\r\x0e\x15\x17\x7f"
+"""What ends or empties a line in MicroPython's REPL; Ctrl-D on an empty one restarts the MCU."""
 
 SILENT_US = 1_000_000
 """With commands under way and no packet, or no answer to any of them, for so long, the MCU counts as gone."""
@@ -186,6 +189,16 @@ def wire_packet(message_id: int, seq: int, payload: bytes) -> bytes:
     return bytes(wire[: codec.encode(body, length, wire)])
 
 
+def _is_harmless(greeting: bytes) -> bool:
+    """Return whether a greeting neither interrupts MicroPython's start, nor restarts it from its REPL.
+
+    The first byte of most is Ctrl-D, as the fourth of their bodies is a zero. So each has to leave text on the REPL's line for the next.
+    """
+    rest = greeting[1:]
+    text = rest[max(map(rest.rfind, _ERASERS)) + 1 :]
+    return CTRL_C not in greeting and CTRL_D not in rest and any(32 <= byte < 127 for byte in text)
+
+
 class Link:
     """Commands out, messages in. `on_message` is called with every message but acknowledgements."""
 
@@ -292,9 +305,12 @@ class Link:
             self.heard_us = self._answered_us = self._carrier.now_us()
         message_id = _BY_NAME[command.name][1]
         command.packet = wire_packet(message_id, self._seq, command.payload)
-        while command.name == "hello" and CTRL_C in command.packet:  # it may meet MicroPython's start, and would end it
-            self._seq = (self._seq + 1) & 255
-            command.packet = wire_packet(message_id, self._seq, command.payload)
+        if command.name == "hello":
+            for seq in range(self._seq, self._seq + 256):
+                packet = wire_packet(message_id, seq & 255, command.payload)
+                if _is_harmless(packet):
+                    self._seq, command.packet = seq & 255, packet
+                    break
         command.seq = self._seq
         command.sent_us = self._carrier.now_us()
         self._seq = (self._seq + 1) & 255

@@ -315,6 +315,13 @@ def test_session_opens_although_greetings_are_lost(lost):
     session.flush()
 
 
+def test_greeting_is_sent_although_no_number_suits_it():
+    link, carrier, _ = link_to(faithful)
+    link.post("hello", {"protocol": messages.PROTOCOL, "dictionary": 0x03030303})
+    settle(link)
+    assert carrier.arrived[0][:2] == (messages.HELLO, 0)
+
+
 def test_session_with_nobody_says_so_within_two_seconds():
     carrier = ScriptedCarrier(lambda *_: (b"", 0))
     with pytest.raises(LinkSilent, match=r"no answer within 1.5 s: is the firmware running"):
