@@ -260,8 +260,12 @@ class Future:
             self._begin(tables, puppet)
         is_cut = False
         if self._stage != _SKETCH:
-            is_cut = self._has_changed or self._stage == _NEAR or (self._stage == _COMPUTE and self._wanted() != 0)
-            self._rings.split(tables, self._frame)
+            is_cut = self._stage == _NEAR or (self._stage == _COMPUTE and self._wanted() != 0)
+            if is_cut:
+                self._rings.split(tables, self._frame)
+            else:
+                self._stage = _SPLIT
+                self.work(tables, puppet)
         if self._stage == _SKETCH or (self._frame and puppet.expects_news()):
             self._is_sketchy = False
             self.is_sketched = is_cut = True

@@ -33,7 +33,7 @@ from shared.formats import (
 )
 
 _COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
-_SHORT_US = const(1500)  # of work, behind which there is time for more before the main loop has its turn
+_PORTION_US = const(4000)  # of work, behind which the main loop has its turn
 _CARRY_US = const(21000)  # what putting other tables into force takes
 _MARGIN_US = const(6000)  # between the end of a frame and what is done then
 
@@ -197,13 +197,15 @@ class Puppet:
         if self.exchange.step >= 0:
             future.relent()
         begun_us = now_us = self._board.ticks_us()
-        while clock.ticks_diff(now_us, begun_us) <= _SHORT_US:
-            if self.clock.until_us(now_us) < future.need_us() >> 1:
-                return False
+        while True:
+            need_us = future.need_us()
+            if self.clock.until_us(now_us) < need_us >> 1:
+                return now_us != begun_us
+            if clock.ticks_diff(now_us, begun_us) + need_us > _PORTION_US and now_us != begun_us:
+                return True
             if not future.work(self.tables, self):
-                break
+                return True
             now_us = self._board.ticks_us()
-        return True
 
     def _has_time(self, need_us):
         """Return whether so much time is left until the next frame, or as much as there is behind any."""
