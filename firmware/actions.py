@@ -246,6 +246,15 @@ class Actions:
         )
         # fmt: on
 
+    def nominal_phases(self, master, rate_hz, zero_offset_q28, cycle, fraction_q24):
+        """Write the phases of those who play without their offsets: `N + c`, of which `zero_offset` is the offset of each."""
+        # fmt: off
+        _phases(
+            self.playing, self.found, master, rate_hz, self.tempo_q16, self.kept_cycle, zero_offset_q28,
+            cycle, fraction_q24,
+        )
+        # fmt: on
+
     def _phases(self, playing, found, master, rate_hz):
         # fmt: off
         _phases(

@@ -47,6 +47,7 @@ _ADC = const(0x10013000)
 _WATCHDOG = const(0x10016000)
 _PSM = const(0x10004000)
 _KEPT = const(0x8010000)
+_USB_IN = const(0x14040024)  # buffer control of endpoint 2 to the host, which is the serial port's
 
 _DIVIDER_SERVO = const(640)  # 40, in the register's Q4
 _DIVIDER_BRIDGE = const(16)
@@ -55,6 +56,12 @@ _BRIDGE_COUNTS = const(6250)
 _ALARM_SLACK_US = const(300)
 _SLEEP_US = const(1200)
 _WATCHDOG_MAX_MS = const(8000)
+_USB_BYTES = const(256)  # what MicroPython's buffer to the host holds
+_USB_ANSWERS = const(64)  # of that, what telemetry leaves to answers
+_USB_LOOKS = const(8)  # at a buffer that is being sent; a packet of USB takes 50 us
+_UART_CHARACTER_US = const(87)
+_UART_US = const(87000)  # what the buffer of the UART holds, as time
+_UART_TELEMETRY_US = const(26000)  # of that, what telemetry may take: an answer waits behind it
 _BURST_BITS = const(640)  # the longest I2C transfer, 66 bytes with their acknowledgements, and a little
 _POSES = const(1)  # words that a reset leaves as they are, after the tag
 _RESETS = const(17)
@@ -202,6 +209,13 @@ def _alarm_us() -> int:
 
 
 @micropython.viper
+def _usb_is_idle() -> int:
+    """Return whether the endpoint to the host has nothing left that the host has not taken."""
+    base = _USB_IN
+    return 0 if int(ptr32(base << 2)[0]) & 0x4000400 else 1  # AVAILABLE of both halves
+
+
+@micropython.viper
 def _guard(on: int, load: int):
     """Switch the watchdog on or off. It resets all but the oscillators."""
     base = _WATCHDOG
@@ -282,6 +296,8 @@ class Board:
         rx = machine.Pin(1, pull=machine.Pin.PULL_UP)
         self._uart = machine.UART(0, _UART_BAUD, tx=machine.Pin(0), rx=rx, rxbuf=1024, txbuf=1024)
         self._to_uart = False
+        self._line_us = 0  # when the UART will have sent all that it has been given
+        self._usb_bytes = _USB_BYTES  # at most so many of the buffer's have not been sent
         self._usb_poll = select.poll()
         self._usb_poll.register(sys.stdin, select.POLLIN)
         self._usb_room = select.poll()
@@ -414,17 +430,41 @@ class Board:
             self._to_uart = True
         return count
 
-    def send(self, buffer, length):
-        """Send the first `length` bytes of `buffer` to where the last bytes came from.
+    def send(self, buffer, length, is_telemetry=False):
+        """Send the first `length` bytes of `buffer`, at most 252, to where the last bytes came from, or drop them.
 
-        A host that has stopped reading USB holds the caller up once, for a second at most; what follows is dropped
-        until it reads again: telemetry may be lost, and answers it will ask for again.
+        What has not all its room now is dropped, as MicroPython would wait for it, over USB for half a second when the host does
+        not read: telemetry may be lost, and answers the host will ask for again. Telemetry leaves some room for those.
         """
         if self._to_uart:
+            self._send_uart(buffer, length, _UART_TELEMETRY_US if is_telemetry else _UART_US)
+        else:
+            self._send_usb(buffer, length, _USB_BYTES - _USB_ANSWERS if is_telemetry else _USB_BYTES)
+
+    def _send_uart(self, buffer, length, most_us):
+        now_us = time.ticks_us()
+        ahead_us = ticks_diff(self._line_us, now_us)
+        if not 0 < ahead_us <= _UART_US:
+            ahead_us = 0
+        ahead_us += length * _UART_CHARACTER_US
+        if ahead_us <= most_us:
+            self._line_us = _later(now_us, ahead_us)
             self._uart.write(buffer, length)  # type: ignore[call-arg]  # the stub lacks the length
-            return
-        for _ in self._usb_room.ipoll(0):
-            self._stdout.write(buffer, length)
+
+    def _send_usb(self, buffer, length, most):
+        looks = _USB_LOOKS
+        while self._usb_bytes and self._usb_bytes + length > most:
+            if looks == 0:
+                return
+            looks -= 1
+            # With an idle endpoint before and behind a turn of the USB stack, which would have gone on, the buffer is empty.
+            was_idle = _usb_is_idle()
+            for _ in self._usb_room.ipoll(0):
+                pass
+            if was_idle and _usb_is_idle():
+                self._usb_bytes = 0
+        self._usb_bytes += length
+        self._stdout.write(buffer, length)
 
     # --- pins
 

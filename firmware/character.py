@@ -111,8 +111,9 @@ class Character:
 
     def rearrange(self, gather_words, keep, scratch, dofs):
         """Let other tables have other DOFs."""
-        for values in (self.output_q24, self._before_q24, self._rate_q24):
-            gather_words(values, keep, scratch, dofs, _ZERO, 0)
+        gather_words(self.output_q24, keep, scratch, dofs, _ZERO, 0)
+        gather_words(self._before_q24, keep, scratch, dofs, _ZERO, 0)
+        gather_words(self._rate_q24, keep, scratch, dofs, _ZERO, 0)
 
     def load(self, tables):
         """Take over which DOFs have a character, and its coefficients; a tick may come in between. Allocates."""

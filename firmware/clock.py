@@ -12,6 +12,7 @@ from micropython import const
 
 TICKS_MASK = const(0x3FFFFFFF)
 _TICKS_HALF = const(0x20000000)
+_LONG_US = const(0x10000000)
 
 # Places in the master phase array: P = whole + (sixteenth + remainder / F) / 65536, whole modulo 2^28.
 PHASE_WHOLE = const(0)
@@ -32,29 +33,40 @@ def ticks_diff(later, earlier):
 class FrameClock:
     """Tells when frames are due; measures how late they were begun.
 
-    `rate_hz` is the frame rate, 10..60. `late_max_us` is how late a frame was begun at most since `start`.
+    `rate_hz` is the frame rate, 10..60. `late_us` is how late the last frame was begun, `late_max_us` how late one was at most since
+    `start`.
     """
 
     def __init__(self):
         self.rate_hz = 30
         self.due_us = 0
-        self.late_max_us = 0
+        self.late_us = self.late_max_us = 0
         self._remainder = 0
+        self._is_held = False
+
+    def hold(self, rate_hz):
+        """Let no frame be due until `start`, and `until_us` a long time."""
+        self.rate_hz = rate_hz
+        self._is_held = True
 
     def start(self, due_us, rate_hz):
         """Make frame 0 due at this instant, now or soon."""
         self.rate_hz = rate_hz
+        self._is_held = False
         self.due_us = due_us
         self.late_max_us = 0
         self._remainder = 0
 
     def until_us(self, now_us):
         """Return how long until the next frame is due, in microseconds; 0 or less when it is."""
+        if self._is_held:
+            return _LONG_US
         return ticks_diff(self.due_us, now_us)
 
     def begin(self, now_us):
         """Note the lateness of the frame that begins now, and set the instant at which the next one is due."""
         late_us = ticks_diff(now_us, self.due_us)
+        self.late_us = late_us
         if late_us > self.late_max_us:
             self.late_max_us = late_us
         rate_hz = self.rate_hz

@@ -16,6 +16,7 @@ from firmware.exchange import check_kept
 from firmware.tables import halves
 from shared import codec, messages
 from shared.formats import (
+    BANDS,
     DEVICE_SETTINGS_MAX,
     KILLED_BY_HOST,
     TAP_BASE,
@@ -31,6 +32,7 @@ _LEAN = (
     messages.WEIGHT_TARGETS,
     messages.LIVE_TARGETS,
     messages.TEMPO,
+    messages.GAINS,
     messages.ARM,
     messages.KILL,
     messages.TELEMETRY,
@@ -43,6 +45,7 @@ _LEAN = (
 _LARGE = const(0x3FFFFFFF)  # more than any field may have, and no large integer
 
 _HELLO_FORMAT = messages.struct_format(messages.find(messages.HELLO)[2])
+_DICTIONARY = codec.crc32(messages.canonical_text().encode())  # here, while the heap has room for the text
 _MAPPING_FORMAT = messages.struct_format(messages.find(messages.MAPPINGS)[3])
 
 
@@ -69,7 +72,7 @@ class Commands:
 
     def __init__(self, puppet, telemetry, store):
         self.detail = 0
-        self.dictionary = codec.crc32(messages.canonical_text().encode())
+        self.dictionary = _DICTIONARY
         self._puppet = puppet
         self._telemetry = telemetry
         self.store = store
@@ -280,6 +283,9 @@ class Commands:
 
     def _on_tempo(self, body, length):
         return self._queue(cues.TEMPO, body, length, self._puppet.tables.actions)
+
+    def _on_gains(self, body, length):
+        return self._queue(cues.GAIN, body, length, BANDS)
 
     def _on_arm(self, body, length):
         puppet = self._puppet

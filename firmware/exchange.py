@@ -71,6 +71,10 @@ class Exchange:
     def __init__(self, puppet):
         self.step = -1
         self._puppet = puppet
+        a = puppet.actions
+        self._of_actions = (
+            a.target_q28, a.x_q28, a.w_q28, a.before_q28, a.start_q18, a.fraction_q24, a.tempo_q16, a.wanted_tempo_q16
+        )  # fmt: skip
         self._drawn = None  # seed and spread of the gradients that play
         self._gradients = halves(NOISE_TABLES * GRADIENTS)  # those of the staged tables
         self._old_mapping = halves(MAPPINGS_MAX)
@@ -103,22 +107,30 @@ class Exchange:
         for mapping in range(puppet.staged.mappings):
             self._old_mapping[mapping] = _NOT_KEPT
         self._swap()
+        puppet.processing.load(puppet.tables.frame_rate_hz)
         puppet.motor.load(puppet.tables)
 
     def carry_over(self):
         """Put the prepared tables into force between two frames; what keeps its name goes on."""
         puppet = self._puppet
-        old = puppet.tables
-        new = puppet.staged
+        micropython.heap_lock()  # what allocates nothing is twice as fast then
+        try:
+            self._carry_synthesis(puppet.tables, puppet.staged)
+        finally:
+            micropython.heap_unlock()
+        puppet.motor.exchange(puppet.staged, gather_words, gather_halves, self._scratch)
+        self._swap()
+
+    def _carry_synthesis(self, old, new):
+        puppet = self._puppet
         scratch = self._scratch
         a = puppet.actions
+        puppet.future.exchange(old, new, puppet, scratch)
         keep = new.keep_action
         count = new.actions
-        for values in (a.target_q28, a.x_q28, a.w_q28, a.before_q28, a.start_q18, a.fraction_q24):
+        for values in self._of_actions:
             gather_words(values, keep, scratch, count, 0, 0)
         gather_words(a.offset_q28, keep, scratch, count, WEIGHT_ONE, 0)  # one cycle: no offset
-        gather_words(a.tempo_q16, keep, scratch, count, 0, 0)
-        gather_words(a.wanted_tempo_q16, keep, scratch, count, 0, 0)
         settle_tempos(keep, old.tempo_q16, new.tempo_q16, count, a.tempo_q16, a.wanted_tempo_q16)
         gather_halves(a.cycle, keep, scratch, count, 0, 0)
         gather_halves(a.kept_cycle, keep, scratch, count, 0, 0)
@@ -129,18 +141,18 @@ class Exchange:
             if keep[live] == NEW:
                 for values in puppet.live_state:
                     values[live] = new.live_rest_q28[live]
+        puppet.kalman.rearrange(gather_words, keep, scratch, new)
         keep = new.keep_dof
+        puppet.processing.rearrange(gather_words, keep, scratch, new.dofs)
         for values in puppet.hold_state:
             gather_words(values, keep, scratch, new.dofs, WEIGHT_ONE, 0)
-        for values in (puppet.base_q15, puppet.hold_q15):
-            gather_halves(values, keep, scratch, new.dofs, 0, 0)
+        gather_halves(puppet.base_q15, keep, scratch, new.dofs, 0, 0)
+        gather_halves(puppet.hold_q15, keep, scratch, new.dofs, 0, 0)
         for dof in range(new.dofs):
             if keep[dof] == NEW:
                 puppet.base_q15[dof] = puppet.hold_q15[dof] = new.rest_q15[dof]
         puppet.cues.renumber(new.keep_action, new.actions, new.keep_live, new.lives)
         puppet.base_ring.rearrange(gather_halves, keep, scratch, new.dofs, puppet.frame, new.rest_q15)
-        puppet.motor.exchange(new, gather_words, gather_halves, scratch)
-        self._swap()
 
     def _swap(self):
         puppet = self._puppet

@@ -2,8 +2,8 @@
 
 Commands carry sequence numbers and are carried out in their order, each exactly once. A packet that is damaged is as
 good as lost; one that comes after a gap is answered with the number that is expected, a repeated one with its first
-answer. `hello` begins a session with whatever number it has. What commands mean is in `commands`, what the MCU tells by
-itself in `telemetry`.
+answer. `hello` begins a session with whatever number it has; one that was repeated or overtaken on its way begins nothing.
+What commands mean is in `commands`, what the MCU tells by itself in `telemetry`.
 
 The REPL is called for by `0D 03` where a packet would begin and then a pause, another `0D`, or another `03`, as
 mpremote and others do it. `0D 03` alone would not do: a single flipped bit can make a packet begin with it, and would
@@ -25,9 +25,13 @@ from shared import codec, messages
 from shared.formats import ACTIONS_MAX, DOFS_MAX, KILLED_BY_HOST, LIVES_MAX, MAPPINGS_MAX, QUEUE_MAX
 
 _CHUNK = const(32)  # bytes taken between two looks at the frame clock; one costs up to 50 us on USB
+_TOO_LONG = const(1000)  # more than any packet has, where the length of what never ends stays
 _STALE_US = const(20000)  # a partial packet older than this is dropped
 _HISTORY = const(16)  # answers kept for repeated commands; the host has fewer under way
+_GREETINGS = const(8)  # a greeting with one of the last so many numbers ..
+_GREETING_US = const(150000)  # .. within this time is one that was repeated or overtaken
 _PAYLOAD = const(2)  # place of the payload in a body
+_COUNT_MAX = const(0x3FFFFFFF)  # where counts stay, as a larger one would need memory
 
 _WELCOME_FIELDS = messages.find(messages.WELCOME)[2]
 _WELCOME_FORMAT = messages.struct_format(_WELCOME_FIELDS)
@@ -54,7 +58,8 @@ def _collect(chunk: ptr8, start: int, end: int, wire: ptr8, length: int, room: i
 class Link:
     """Receives and answers for one puppet.
 
-    `packets` and `damaged` count what came, `is_behind` tells that more may have come than `poll` has taken. `commands`,
+    `packets` and `damaged` count what came, `is_behind` tells that more may have come than `poll` has taken,
+    `has_heard` that it has taken anything since that was set to False. `commands`,
     `telemetry` and `store` are its parts. A packet to send is put into `out`, two bytes of head first, and sent by `send`.
     """
 
@@ -62,6 +67,7 @@ class Link:
         self.packets = 0
         self.damaged = 0
         self.is_behind = False
+        self.has_heard = False
         self._has_paused = False
         self.out = bytearray(codec.BODY_MAX)
         self.telemetry = Telemetry(board, puppet, self)
@@ -76,9 +82,12 @@ class Link:
         self._out_wire = bytearray(codec.WIRE_MAX)
         self._out_seq = 0
         self._expected = -1  # no session yet
+        self._greeting = 0  # the number with which the session has begun
+        self._greeted_us = 0
         self._kills = False  # whether a kill has been carried out before its turn
         self._statuses = bytearray(_HISTORY)
         self._details = [0] * _HISTORY
+        self._seals = bytearray(2 * _HISTORY)  # half of the checksum of each
         self._byte_us = board.ticks_us()
 
     def poll(self):
@@ -101,15 +110,18 @@ class Link:
         if end == 0:
             self._has_paused = True
             return False
+        self.has_heard = True
         # Only where the line was seen to be still: the main loop itself may have been away for longer.
         if self._length and self._has_paused and ticks_diff(now_us, self._byte_us) > _STALE_US:
             self._length = 0
-            self.damaged += 1
+            self._drop()
         self._has_paused = False
         start = 0
         while start < end:
             stop = _collect(chunk, start, end, wire, self._length, codec.WIRE_MAX)
             self._length += stop - start
+            if self._length > _TOO_LONG:
+                self._length = _TOO_LONG
             start = stop + 1
             if stop < end:
                 length = self._length
@@ -123,33 +135,35 @@ class Link:
         """Send the telemetry that is due after a frame."""
         self.telemetry.report()
 
-    def send(self, message_id, length):
-        """Send `out[:length]` as a packet; its head is written here."""
+    def send(self, message_id, length, is_telemetry=False):
+        """Send `out[:length]` as a packet; its head is written here. What the line has no room for is lost."""
         out = self.out
         out[0] = message_id
         out[1] = self._out_seq
         self._out_seq = (self._out_seq + 1) & 255
         length = codec.seal(out, length)
-        self._board.send(self._out_wire, codec.encode(out, length, self._out_wire))
+        self._board.send(self._out_wire, codec.encode(out, length, self._out_wire), is_telemetry)
 
     def _packet(self, length):
         body = self._wire
         if length > codec.WIRE_MAX:
-            self.damaged += 1
+            self._drop()
             return
         length = codec.decode(body, length)
         if length < 0 or not codec.is_sealed(body, length) or body[0] >= 128:
-            self.damaged += 1
+            self._drop()
             return
-        self.packets += 1
+        if self.packets < _COUNT_MAX:
+            self.packets += 1
         self._puppet.motor.heard()
         message_id = body[0]
         seq = body[1]
         if message_id == messages.KILL:  # now, whatever is missing before it; in its turn it is carried out again
             self._puppet.motor.kill(KILLED_BY_HOST)
             self._kills = 0 < (seq - self._expected) & 255 < 128
-        if message_id == messages.HELLO:
-            self._expected = seq
+        if message_id == messages.HELLO and not self._is_old_greeting(seq):
+            self._expected = self._greeting = seq
+            self._greeted_us = self._board.ticks_us()
             self._kills = False
         elif self._expected < 0:
             return  # no session: the host has to say hello
@@ -166,18 +180,36 @@ class Link:
             else:
                 status = self.commands.carry_out(message_id, body, length - codec.OVERHEAD)
             detail = self.commands.detail
-            self._statuses[seq % _HISTORY] = status
-            self._details[seq % _HISTORY] = detail
+            place = seq % _HISTORY
+            self._statuses[place] = status
+            self._details[place] = detail
+            self._seals[2 * place] = body[length - 4]
+            self._seals[2 * place + 1] = body[length - 3]
             self._expected = (seq + 1) & 255
             self._answer(seq, status, detail)
             if message_id == messages.HELLO:
                 self._welcome()
             elif message_id == messages.STATUS_REQUEST:
                 self.telemetry.status()
-        elif ahead >= 256 - _HISTORY:  # repeated: its answer was lost
+        elif ahead >= 256 - _HISTORY and self._is_repeated(seq, body, length):  # its answer was lost
             self._answer(seq, self._statuses[seq % _HISTORY], self._details[seq % _HISTORY])
+            if message_id == messages.HELLO and seq == self._greeting:
+                self._welcome()
         else:
             self._answer(seq, messages.RESEND, self._expected)
+
+    def _is_repeated(self, seq, body, length):
+        """Return whether a command is the one that had its number, and not another host's."""
+        place = 2 * (seq % _HISTORY)
+        return body[length - 4] == self._seals[place] and body[length - 3] == self._seals[place + 1]
+
+    def _is_old_greeting(self, seq):
+        since_us = ticks_diff(self._board.ticks_us(), self._greeted_us)
+        return self._expected >= 0 and (self._greeting - seq) & 255 < _GREETINGS and 0 <= since_us < _GREETING_US
+
+    def _drop(self):
+        if self.damaged < _COUNT_MAX:
+            self.damaged += 1
 
     def _answer(self, seq, status, detail):
         out = self.out

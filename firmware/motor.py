@@ -226,18 +226,22 @@ class Motor:
         self._board.kept_pose(0, self.position_q24, _tag(tables))  # from now on it is kept under the new tag
 
     def _rearrange(self, before, tables, gather_words, gather_halves, scratch):
+        going_on = self._drivers.load(tables)
+        micropython.heap_lock()  # what follows is twice as fast then
+        try:
+            self._gather(before, tables, going_on, gather_words, gather_halves, scratch)
+        finally:
+            micropython.heap_unlock()
+
+    def _gather(self, before, tables, going_on, gather_words, gather_halves, scratch):
         keep = tables.keep_dof
         dofs = tables.dofs
         attached = 0
-        going_on = self._drivers.load(tables)
-        for values, fresh in (
-            (self.position_q24, 0),
-            (self.velocity_q24, ZERO_Q24),
-            (self.reference_q24, ZERO_Q24),
-            (self._correction_q24, ZERO_Q24),
-            (self._force_q24, 0),
-        ):
-            gather_words(values, keep, scratch, dofs, fresh, 0)
+        gather_words(self.position_q24, keep, scratch, dofs, 0, 0)
+        gather_words(self.velocity_q24, keep, scratch, dofs, ZERO_Q24, 0)
+        gather_words(self.reference_q24, keep, scratch, dofs, ZERO_Q24, 0)
+        gather_words(self._correction_q24, keep, scratch, dofs, ZERO_Q24, 0)
+        gather_words(self._force_q24, keep, scratch, dofs, 0, 0)
         for place in range(2):
             gather_words(self._before_q24, keep, scratch, dofs, 0, place * _DOFS)
             gather_halves(self._end_q4us, keep, scratch, dofs, 0, place * _DOFS)

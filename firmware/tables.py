@@ -6,6 +6,8 @@ that a kernel will use is checked here, because viper checks nothing. All arrays
 
 from array import array
 
+import micropython
+
 from firmware.programs import check as check_program
 from shared import program as isa
 from shared.formats import (
@@ -44,6 +46,7 @@ from shared.formats import (
     NOISE_TABLES,
     POSITION_BITS,
     POSITION_ONE,
+    PREDICT_KALMAN,
     PULSE_BITS,
     PULSE_GAP_US,
     PULSE_MAX_US,
@@ -60,6 +63,7 @@ from shared.formats import (
     TURNS_MAX,
     VALUE_BITS,
     VALUE_ONE,
+    VARIANCE_MAX_Q16,
     WEIGHT_ONE,
 )
 
@@ -71,14 +75,39 @@ _UNIT_TO_POSITION = POSITION_BITS - VALUE_BITS
 _RESPONSES = 6  # coefficients of a character
 
 
+@micropython.viper
+def _clear_words(values: ptr32, count: int):
+    """Set words to 0."""
+    i = 0
+    while i < count:
+        values[i] = 0
+        i += 1
+
+
+@micropython.viper
+def _clear_halves(values: ptr16, count: int):
+    """Set 16-bit words to 0."""
+    i = 0
+    while i < count:
+        values[i] = 0
+        i += 1
+
+
 def words(count):
-    """Return an array of `count` signed 32-bit words, all 0."""
-    return array("i", bytes(4 * count))
+    """Return an array of `count` signed 32-bit words, all 0.
+
+    It is made from a range, not from bytes: those would be as large as it is, and leave a hole in the heap.
+    """
+    values = array("i", range(count))
+    _clear_words(values, count)
+    return values
 
 
 def halves(count):
     """Return an array of `count` unsigned 16-bit words, all 0."""
-    return array("H", bytes(2 * count))
+    values = array("H", range(count))
+    _clear_halves(values, count)
+    return values
 
 
 def is_pin(pin):
@@ -126,6 +155,7 @@ class Tables:
         # per DOF
         self.relative = bytearray(DOFS_MAX)
         self.rest_q15 = halves(DOFS_MAX)
+        self.signal = bytearray(DOFS_MAX)
         self.hold_q26 = words(DOFS_MAX)
         self.limit_low_q24 = words(DOFS_MAX)
         self.limit_high_q24 = words(DOFS_MAX)
@@ -173,9 +203,14 @@ class Tables:
         self.live_rest_q28 = words(LIVES_MAX)
         self.live_rise_q26 = words(LIVES_MAX)
         self.live_fall_q26 = words(LIVES_MAX)
+        self.live_predict = bytearray(LIVES_MAX)
+        self.live_process_q16 = words(LIVES_MAX)
+        self.live_noise_q16 = words(LIVES_MAX)
+        self.live_fade_q15 = halves(LIVES_MAX)
         # curves, programs, blinks
         self.curve_start = halves(CURVES_MAX)
         self.curve_samples = halves(CURVES_MAX)
+        self.curve_mean_q15 = halves(CURVES_MAX)
         self.samples_q15 = halves(SAMPLES_POOL)
         self.program_start = halves(isa.PROGRAMS_MAX)
         self.program_words = halves(isa.PROGRAMS_MAX)
@@ -298,7 +333,7 @@ class Tables:
             self.device_settings[device * DEVICE_SETTINGS_MAX + place] = settings[place] if place < count else 0
         return None
 
-    def dof(self, dof, kind, rest_q15, low_q15, high_q15, speed_q24, accel_q24):
+    def dof(self, dof, kind, rest_q15, low_q15, high_q15, speed_q24, accel_q24, signal):
         """Store a DOF; it drives nothing until `output` gives it a driver."""
         if not self._robot_seen or dof != self._dofs_seen or dof >= self.dofs:
             return 0
@@ -309,7 +344,10 @@ class Tables:
         bad = self._bad_limit(kind, low_q15, high_q15, speed_q24, accel_q24)
         if bad is not None:
             return 3 + bad
+        if signal > 1:
+            return 7
         self.relative[dof] = kind
+        self.signal[dof] = signal
         self.rest_q15[dof] = VALUE_ONE // 2 if kind == KIND_RELATIVE else rest_q15
         self.limit(dof, low_q15, high_q15, speed_q24, accel_q24)
         self._dofs_seen += 1
@@ -501,10 +539,10 @@ class Tables:
 
     def mapping(self, mapping, dof, function, argument, low_q15, high_q15):
         """Store a mapping. The field numbers count from the item's `dof`, 0; a mapping out of its place is field 0."""
-        if mapping != self._mappings_seen or mapping >= self.mappings or dof >= self.dofs:
+        if mapping != self._mappings_seen or mapping >= self.mappings or dof >= self._dofs_seen:
             return 0
-        if function > FUNCTION_RTRIGSIN:
-            return 1
+        if function > FUNCTION_RTRIGSIN or (function >= FUNCTION_BLINK and self.signal[dof]):
+            return 1  # signal processing needs the future, and nobody knows when there is a blink
         if argument >= self._arguments(function):
             return 2
         if low_q15 > VALUE_ONE:
@@ -554,6 +592,8 @@ class Tables:
         self.samples_q15[self._samples_used] = value_q15
         self._samples_used += 1
         if self._samples_used == self._samples_end:
+            samples = self.samples_q15[self.curve_start[self._curves_seen] : self._samples_end]
+            self.curve_mean_q15[self._curves_seen] = (sum(samples) + len(samples) // 2) // len(samples)
             self._curves_seen += 1
         return None
 
@@ -616,7 +656,7 @@ class Tables:
         keep[kind][first + place] = old
         return None
 
-    def live(self, live, rest_q28, rise_q26, fall_q26):
+    def live(self, live, rest_q28, rise_q26, fall_q26, predict, process_q16, noise_q16, fade_q15):
         """Store a live channel."""
         if live != self._lives_seen or live >= self.lives:
             return 0
@@ -626,9 +666,21 @@ class Tables:
             return 2
         if not 0 < fall_q26 < ALPHA_ONE:
             return 3
+        if predict > PREDICT_KALMAN:
+            return 4
+        if process_q16 > VARIANCE_MAX_Q16:
+            return 5
+        if noise_q16 > VARIANCE_MAX_Q16 or (noise_q16 == 0 and predict == PREDICT_KALMAN):
+            return 6
+        if fade_q15 >= VALUE_ONE:
+            return 7
         self.live_rest_q28[live] = rest_q28
         self.live_rise_q26[live] = rise_q26
         self.live_fall_q26[live] = fall_q26
+        self.live_predict[live] = predict
+        self.live_process_q16[live] = process_q16
+        self.live_noise_q16[live] = noise_q16
+        self.live_fade_q15[live] = fade_q15
         self._lives_seen += 1
         return None
 

@@ -114,12 +114,12 @@ class Telemetry:
                 motor.derive()
                 self._pack_frame(frame)
                 length = _pack_pairs(self._link.out, 6, puppet.tables.dofs, motor.slope_q16, motor.bend_q15)
-                self._link.send(messages.DERIVATIVES, length)
+                self._link.send(messages.DERIVATIVES, length, True)
         if self._weights_every and frame % self._weights_every == 0:
             self._pack_frame(frame)
             actions = puppet.actions
             length = _pack_weights(self._link.out, 6, actions.found, actions.playing, actions.w_q28)
-            self._link.send(messages.WEIGHTS, length)
+            self._link.send(messages.WEIGHTS, length, True)
 
     def _report_taps(self, last):
         """Send the taps that are complete, of frames up to `last`, at most `_MOST` of them."""
@@ -151,7 +151,7 @@ class Telemetry:
             length = _pack_values(out, length, dofs, puppet.signal_ring_q15, place)
         if taps & TAP_MOTOR:
             length = _pack_values(out, length, dofs, puppet.motor.tap_q15, place)
-        self._link.send(messages.TAPS, length)
+        self._link.send(messages.TAPS, length, True)
 
     def status(self):
         """Send `status` and `motor_status`."""
@@ -164,7 +164,8 @@ class Telemetry:
         pack_into(
             _STATUS_FORMAT, link.out, _PAYLOAD, puppet.frame, motor.armed, motor.silent,
             puppet.clock.late_max_us, motor.late_frames, puppet.frame_max_us, link.packets, link.damaged,
-            puppet.cues.counts[0], self._heap_free,
+            puppet.cues.counts[0], puppet.cues.refused, self._heap_free, puppet.clipped,
+            puppet.future.cut_short,
         )
         link.send(messages.STATUS, _STATUS_END)
         pack_into(

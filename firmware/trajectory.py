@@ -267,9 +267,10 @@ class Trajectory:
 
     def rearrange(self, gather_words, gather_halves, keep, scratch, dofs, rest_q15):
         """Let other tables have other DOFs; new ones come from their rest."""
-        for values in (self._knot, self._glide):
-            for place in range(0, len(values), _DOFS):
-                gather_words(values, keep, scratch, dofs, ZERO_Q24, place)
+        for place in range(0, KNOTS * _DOFS, _DOFS):
+            gather_words(self._knot, keep, scratch, dofs, ZERO_Q24, place)
+        for place in range(0, 2 * _DOFS, _DOFS):
+            gather_words(self._glide, keep, scratch, dofs, ZERO_Q24, place)
         self.ring.rearrange(gather_halves, keep, scratch, dofs, self.newest, rest_q15)
 
     def advance(self, dofs, playing, rest_q15):

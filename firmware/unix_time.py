@@ -144,8 +144,8 @@ class VirtualTime:
         self._unread = at
         return count
 
-    def send(self, buffer, length):
-        """Send the first `length` bytes of `buffer`."""
+    def send(self, buffer, length, is_telemetry=False):
+        """Send the first `length` bytes of `buffer`; there is always room."""
         at = self._record(b"S", length)
         out = self._out
         for i in range(length):

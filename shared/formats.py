@@ -12,6 +12,7 @@ VALUE_BITS = 15  # values of DOFs and functions, 0..1 inclusive
 WEIGHT_BITS = 28  # weights, weight targets and live channels, 0..4
 ALPHA_BITS = 26  # filter coefficients 1 - exp(-1 / (F * tau))
 TEMPO_BITS = 16  # tempos, rounded when read (SPEC of time: multiples of 1/65536)
+GAIN_BITS = 16  # gains of bands, -4..4; they travel and are kept as `gain4_q16`, that is gain + 4, which is never negative
 PHASE_BITS = 24  # fraction of a cycle; whole cycles are kept modulo 4096 beside it
 PULSE_BITS = 4  # pulse widths in 1/16 us
 POSITION_BITS = 24  # positions inside the motor layer, 0..1 like values; speeds and accelerations per tick
@@ -22,11 +23,16 @@ WEIGHT_ONE = 1 << WEIGHT_BITS
 WEIGHT_MAX = 4 * WEIGHT_ONE
 ALPHA_ONE = 1 << ALPHA_BITS
 TEMPO_ONE = 1 << TEMPO_BITS
+GAIN_ONE = 1 << GAIN_BITS
+GAIN4_ONE = 5 << GAIN_BITS  # a gain of 1
+GAIN4_MAX = 8 << GAIN_BITS
 POSITION_ONE = 1 << POSITION_BITS
 RESPONSE_ONE = 1 << RESPONSE_BITS
 CYCLES = 4096  # all functions repeat after so many periods
 SNAP_Q28 = 1 << 10  # 2^-18: a weight this near to its target is set to it
 FAINT_Q28 = 1 << 20  # 1/256: below it a weight counts as faint
+
+BANDS = 7  # of signal processing, the highest first
 
 DOFS_MAX = 16
 ACTIONS_MAX = 64
@@ -34,7 +40,7 @@ MAPPINGS_MAX = 512
 LIVES_MAX = 16
 CURVES_MAX = 64
 SAMPLES_MAX = 256  # of one curve
-SAMPLES_POOL = 4096  # of all curves of a puppet
+SAMPLES_POOL = 3072  # of all curves of a puppet
 BLINKS_MAX = 128
 DEVICES_MAX = 4  # chips that outputs share
 DEVICE_SETTINGS_MAX = 8
@@ -50,6 +56,7 @@ TEMPO_MIN_Q16 = 3277  # 0.05
 TEMPO_MAX_Q16 = 8 * TEMPO_ONE
 MASTER_TEMPO_MIN_Q16 = TEMPO_ONE // 4
 MASTER_TEMPO_MAX_Q16 = 4 * TEMPO_ONE
+VARIANCE_MAX_Q16 = 1 << 27  # process and noise of a live channel that is predicted, in a unit of their own
 
 # The motor layer's own rate: one tick every so many microseconds, a multiple of MOTOR_PERIOD_STEP_US.
 MOTOR_PERIOD_MIN_US = 3008
@@ -87,6 +94,10 @@ CYCLES_MAX = 1000  # of a gesture
 # Kinds of DOF.
 KIND_ABSOLUTE = 0
 KIND_RELATIVE = 1
+
+# How the future of a live channel is predicted: its target stays, or goes on at its estimated velocity.
+PREDICT_HOLD = 0
+PREDICT_KALMAN = 1
 
 # Drivers of outputs, and what an output or device without one has.
 DRIVER_PINS = 0

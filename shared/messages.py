@@ -10,7 +10,7 @@ PROTOCOL counts changes of meaning; the checksum of this dictionary catches chan
 exchanged by `hello` and `welcome`, whose layout, with that of `ack`, never changes.
 """
 
-PROTOCOL = 2
+PROTOCOL = 6  # 1 to 5 are control characters of MicroPython's REPL: a greeting must not interrupt or restart what it meets
 
 HELLO = 0x10
 PING = 0x11
@@ -30,6 +30,7 @@ STOP = 0x21
 WEIGHT_TARGETS = 0x22
 LIVE_TARGETS = 0x23
 TEMPO = 0x24
+GAINS = 0x25
 ARM = 0x28
 KILL = 0x29
 TELEMETRY = 0x2A
@@ -102,6 +103,7 @@ MESSAGES = (
             ("high_q15", "H"),
             ("speed_q24", "I"),
             ("accel_q24", "I"),
+            ("signal", "B"),
         ),
         (),
     ),
@@ -172,7 +174,21 @@ MESSAGES = (
         (("first_mapping", "H"),),
         (("dof", "B"), ("function", "B"), ("argument", "H"), ("low_q15", "H"), ("high_q15", "H")),
     ),
-    ("live", LIVE, (("live", "B"), ("rest_q28", "I"), ("rise_q26", "I"), ("fall_q26", "I")), ()),
+    (
+        "live",
+        LIVE,
+        (
+            ("live", "B"),
+            ("rest_q28", "I"),
+            ("rise_q26", "I"),
+            ("fall_q26", "I"),
+            ("predict", "B"),
+            ("process_q16", "I"),
+            ("noise_q16", "I"),
+            ("fade_q15", "H"),
+        ),
+        (),
+    ),
     ("curve", CURVE, (("curve", "B"), ("samples", "H")), (("value_q15", "H"),)),
     ("program", PROGRAM, (("program", "B"), ("words", "H")), (("word", "i"),)),
     ("blink", BLINK, (("blink", "B"), ("threshold_q16", "I"), ("gap_q18", "I")), ()),
@@ -184,6 +200,7 @@ MESSAGES = (
     ("weight_targets", WEIGHT_TARGETS, (("frame", "i"),), (("action", "B"), ("target_q28", "I"))),
     ("live_targets", LIVE_TARGETS, (("frame", "i"),), (("live", "B"), ("target_q28", "I"))),
     ("tempo", TEMPO, (("frame", "i"),), (("action", "B"), ("tempo_q16", "I"))),
+    ("gains", GAINS, (("frame", "i"),), (("band", "B"), ("gain4_q16", "I"))),
     ("arm", ARM, (), ()),
     ("kill", KILL, (), ()),
     ("telemetry", TELEMETRY, (("taps", "B"), ("taps_every", "H"), ("weights_every", "H")), ()),
@@ -239,7 +256,10 @@ MESSAGES = (
             ("packets", "I"),
             ("damaged", "I"),
             ("late_targets", "I"),
+            ("refused_targets", "I"),
             ("heap_free", "I"),
+            ("clipped", "I"),
+            ("cut_short", "I"),
         ),
         (),
     ),

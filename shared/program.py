@@ -37,5 +37,5 @@ SHIFT_MAX = 40
 
 DEPTH_MAX = 16
 WORDS_MAX = 128  # of one program
-POOL_WORDS = 4096  # of all programs of a puppet
+POOL_WORDS = 2560  # of all programs of a puppet
 PROGRAMS_MAX = 255

@@ -17,6 +17,7 @@ _MAPPINGS_LIMIT = 512
 _CHANNELS = ("GAZE_YAW", "GAZE_PITCH", "SPEED", "TURN")
 _NOISES = tuple(f"noise{k}" for k in range(1, 17))
 _CHANNEL_PAIRS = tuple(((2 * k, 2 * k + 1), (2 * k + 16, 2 * k + 17)) for k in range(8))
+_TRIGGERED = ("blink", "rtrigsin")
 _OUTPUT_PINS = {*range(2, 23), *range(26, 29)}
 
 
@@ -81,6 +82,29 @@ def add_random_dynamics(rng, puppet):
             dof["limits"] = _random_limits(rng, relative, 0 if relative else dof.get("rest", 0.5))
         if rng.random() < 0.5:
             dof["character"] = _random_character(rng)
+
+
+def add_random_gains(rng, puppet, score, seconds, reach):
+    """Give moods of a puppet and cues of its score band gains within -reach..reach, and DOFs `signal` keys.
+
+    The first gains come within the first second, and are not all 1. On most DOFs blinks give way to other functions.
+    """
+    blinking = {name for name in puppet["dof"] if rng.random() < 0.1}
+    for mapping in [mapping for action in puppet["action"].values() for mapping in action["map"]]:
+        if mapping[0] not in blinking and mapping[-1].startswith(_TRIGGERED):
+            mapping[-1] = _random_function(rng, "core", {})
+    for name, dof in puppet["dof"].items():
+        if rng.random() < (0.7 if dof.get("kind") == "relative" else 0.2):
+            dof["signal"] = name not in blinking and (dof.get("kind") == "relative" or rng.random() < 0.5)
+    for mood in puppet.get("mood", {}).values():
+        if rng.random() < 0.7:
+            mood["gains"] = _random_gains(rng, reach)
+    frame_rate = puppet.get("frame_rate", 30)
+    times_s = [rng.choice((0, _random_time(rng, 1, frame_rate)))]
+    times_s += [_random_time(rng, seconds, frame_rate) for _ in range(rng.choice((0, 0, 1, 3, 8)))]
+    for n, at_s in enumerate(times_s):
+        score["cue"].append({"at": at_s, "gains": _random_gains(rng, reach, flat=n > 0)})
+    rng.shuffle(score["cue"])
 
 
 def random_robot(rng, puppet):
@@ -252,7 +276,7 @@ def _random_function(rng, level, functions):
         case "triggered":
             threshold = rng.choice((0, 0.5, 0.93, _decimal(rng, 0, 1)))
             min_gap = rng.choice((0, 1.2, 2, _logarithmic(rng, 0.1, 1000)))
-            name = rng.choice(("blink", "rtrigsin"))
+            name = rng.choice(_TRIGGERED)
             return rng.choice((name, f"{name}({threshold}, {min_gap})"))
         case "function" if functions:
             return rng.choice(list(functions))
@@ -284,14 +308,29 @@ def _random_action(rng, level, puppet, longest):
 def _random_mood(rng, gains):
     mood = {}
     if gains and rng.random() < 0.7:
-        mood["gains"] = _random_gains(rng)
+        mood["gains"] = _any_gains(rng)
     if rng.random() < 0.7:
         mood["tempo"] = _logarithmic(rng, 0.25, 4)
     return mood
 
 
-def _random_gains(rng):
+def _any_gains(rng):
     return rng.choice(([1] * 7, [_decimal(rng, -2, 2) for _ in range(7)], [_decimal(rng, -4, 4) for _ in range(7)]))
+
+
+def _random_gains(rng, reach, flat=True):
+    """Return gains: any, all at the ends of their range, one of them other than 1, or, if `flat`, all 1."""
+    kinds = ["any", "any", "ends", "one"] + ["flat"] * flat
+    match rng.choice(kinds):
+        case "any":
+            return [_decimal(rng, -reach, reach) for _ in range(7)]
+        case "ends":
+            return [rng.choice((-reach, reach)) for _ in range(7)]
+        case "one":
+            gains = [1] * 7
+            gains[rng.randrange(7)] = rng.choice((-reach, 0, reach, _decimal(rng, -reach, reach)))
+            return gains
+    return [1] * 7
 
 
 def _random_time(rng, seconds, frame_rate):
@@ -326,7 +365,7 @@ def _random_cue(rng, puppet, level, gains):
         if "mood" in puppet and rng.random() < 0.15:
             cue["mood"] = rng.choice(list(puppet["mood"]))
         if gains and rng.random() < 0.1:
-            cue["gains"] = _random_gains(rng)
+            cue["gains"] = _any_gains(rng)
     if tempo:
         cue["tempo"] = tempo
     return cue

@@ -75,6 +75,7 @@ class ReferencePuppet:
     Attributes:
         dofs: names of the DOFs in file order.
         frame: the frame that the next `step` computes.
+        cues: lists of the cues that act in a frame, in their order, by frame.
         weight_sums: per DOF the sum of weights, HOLD included, in the frame just stepped.
     """
 
@@ -85,10 +86,10 @@ class ReferencePuppet:
         self._closest = dict.fromkeys(("enter", "hold", "silence", "wrap", "gesture"), math.inf)
         self._behaviours = puppet.get("behaviour", {})
         self._moods = puppet.get("mood", {})
-        self._cues = defaultdict(list)
+        self.cues = defaultdict(list)
         for cue in sorted(score.get("cue", []), key=lambda cue: Fraction(str(cue["at"]))):
-            self._cues[frame_of_cue(cue["at"], self.frame_rate)].append(cue)
-        self._cue_frames = list(self._cues)
+            self.cues[frame_of_cue(cue["at"], self.frame_rate)].append(cue)
+        self._cue_frames = list(self.cues)
         self._master = 0
         self._global_tempo_q16 = TEMPO_ONE_Q16
         self._live = defaultdict(lambda: SmoothedValue(_LIVE_REST, _LIVE_TAU_S, self.frame_rate))
@@ -182,8 +183,8 @@ class ReferencePuppet:
         It can in frames of cues and of the ends of gestures, which may begin in this frame.
         """
         return (
-            self.frame in self._cues
-            or self.frame + 1 in self._cues
+            self.frame in self.cues
+            or self.frame + 1 in self.cues
             or any(action.gesture_runs for action in self._actions.values())
         )
 
@@ -192,7 +193,7 @@ class ReferencePuppet:
         actions = self._actions.values()
         for action in actions:
             action.target_before = action.weight.target
-        for cue in self._cues.get(self.frame, ()):
+        for cue in self.cues.get(self.frame, ()):
             self._apply(cue)
         for action in actions:
             if action.gesture_runs and not action.rises:

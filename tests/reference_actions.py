@@ -105,7 +105,7 @@ class Action:
         self.rose_at = None
         self.mappings = []
         self.triggered = []
-        self._ticks_per_period = frame_rate * TEMPO_ONE_Q16 * TEMPO_ONE_Q16
+        self.ticks_per_period = frame_rate * TEMPO_ONE_Q16 * TEMPO_ONE_Q16
 
     @property
     def rises(self):
@@ -118,16 +118,16 @@ class Action:
 
     def phase(self, master):
         """Return the phase in periods, whole ones included."""
-        ticks = self.tempo_q16 * master + self.whole_periods * self._ticks_per_period
-        return ticks / self._ticks_per_period + self.offset
+        ticks = self.tempo_q16 * master + self.whole_periods * self.ticks_per_period
+        return ticks / self.ticks_per_period + self.offset
 
     def exact_nominal(self, master):
         """Return the nominal phase in periods, a fraction."""
-        return Fraction(self.tempo_q16 * master, self._ticks_per_period)
+        return Fraction(self.tempo_q16 * master, self.ticks_per_period)
 
     def nominal_advance(self, global_tempo_q16):
         """Return the periods by which the nominal phase advances in one frame."""
-        return self.tempo_q16 * global_tempo_q16 / self._ticks_per_period
+        return self.tempo_q16 * global_tempo_q16 / self.ticks_per_period
 
     def split_offset(self, excess):
         """Keep an exact difference from the nominal phase as whole periods and an offset."""

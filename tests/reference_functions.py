@@ -18,6 +18,7 @@ Readings where the definitions leave a choice:
 import ast
 import math
 from fractions import Fraction
+from typing import ClassVar
 
 _MASK_32 = 0xFFFFFFFF
 _SEED_FACTOR = 0x9E3779B1
@@ -144,23 +145,30 @@ class FunctionCompiler:
     Raises:
         ValueError: from `compile`, when a text is not in the grammar. This is a safety net for the
             generator of puppets, not the checker of files.
+
+    What it builds of numbers are its class attributes, so that a subclass can take arrays of phases.
     """
+
+    WAVES: ClassVar = {"rsin": rsin, "rcos": rcos}
+    noise = staticmethod(noise)
+    table_value = staticmethod(table_value)
+    least, most = min, max
 
     def __init__(self, puppet, read_live):
         self._functions = puppet.get("function", {})
         self._seed = puppet.get("seed", _DEFAULT_SEED)
         self._read_live = read_live
-        self._primitives = {"rsin": rsin, "rcos": rcos}
+        self._primitives = dict(self.WAVES)
         for k in range(1, 17):
             gradients = noise_gradients(self._seed, k, puppet.get("noise_spread", 0))
-            self._primitives[f"noise{k}"] = lambda x, gradients=gradients: noise(gradients, x)
+            self._primitives[f"noise{k}"] = lambda x, gradients=gradients: self.noise(gradients, x)
 
     def compile(self, text, mapping_index):
         """Return the callable of FUNCTION `text`; `mapping_index` counts the puppet's mappings from 0."""
         if text in self._functions:
             definition = self._functions[text]
             if "table" in definition:
-                return lambda phase: table_value(definition["table"], phase)
+                return lambda phase: self.table_value(definition["table"], phase)
             text = definition["expr"]
         elif text in self._primitives or text in _TRIGGERED:
             text += "(t)" if text in self._primitives else "()"
@@ -168,7 +176,7 @@ class FunctionCompiler:
         if isinstance(tree, ast.Call) and tree.func.id in _TRIGGERED:
             return self._triggered(tree, mapping_index)
         expression = self._expression(tree)
-        return lambda phase: min(max(expression(phase), 0.0), 1.0)
+        return lambda phase: self.least(self.most(expression(phase), 0.0), 1.0)
 
     def _triggered(self, call, mapping_index):
         options = {"threshold": _DEFAULT_THRESHOLD, "min_gap": _DEFAULT_MIN_GAP_PERIODS}
@@ -210,7 +218,7 @@ class FunctionCompiler:
         if name == "table":
             samples = self._functions[call.args[0].id]["table"]
             argument = call.args[1] if len(call.args) > 1 else ast.Name("t")
-            return _at_phase(lambda x: table_value(samples, x), argument)
+            return _at_phase(lambda x: self.table_value(samples, x), argument)
         if name == "live":
             channel = call.args[0].id
             return lambda phase: self._read_live(channel)
@@ -218,7 +226,7 @@ class FunctionCompiler:
             return self._expression(call.args[0])
         operands = [self._expression(argument) for argument in call.args]
         if name in ("min", "max", "abs"):
-            combine = {"min": min, "max": max, "abs": abs}[name]
+            combine = {"min": self.least, "max": self.most, "abs": abs}[name]
             return lambda phase: combine(*[operand(phase) for operand in operands])
         if name == "lerp":
             start, end, x = operands
@@ -228,7 +236,7 @@ class FunctionCompiler:
             bounds.update({keyword.arg: self._expression(keyword.value) for keyword in call.keywords})
             low = bounds.get("lo", lambda phase: 0.0)
             high = bounds.get("hi", lambda phase: 1.0)
-            return lambda phase: min(max(operands[0](phase), low(phase)), high(phase))
+            return lambda phase: self.least(self.most(operands[0](phase), low(phase)), high(phase))
         raise ValueError(f"not a function: {name}")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from bench_stage import ACTIONS, Stage
+from bench_stage import ACTIONS, Stage, start_firmware
 
 from marotte.link import VirtualCarrier
 from marotte.mcu.raw_repl import RawRepl
@@ -90,7 +90,7 @@ def percentile(values: list[int], share: float) -> int:
 def _measure(image: str, name: str, stage: Stage) -> Ticks:
     with Rp2040Mcu(image, timed_flash=False) as mcu:
         repl = RawRepl(mcu)
-        repl.start(PROGRAM.format(ticks=TICKS, period_us=stage.motor_period_us))
+        start_firmware(repl, PROGRAM.format(ticks=TICKS, period_us=stage.motor_period_us))
         session = Session(VirtualCarrier(mcu))
         session.open()
         session.upload(stage)  # type: ignore[arg-type]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench_stage import ACTIONS, FRAMES, MAPPINGS, PATIENCE_US, PLAYING, Cost, Stage, load, numbers, play
+from bench_stage import ACTIONS, MAPPINGS, PATIENCE_US, PLAYING, Cost, Stage, load, numbers, play
 
 from marotte.mcu.raw_repl import RawRepl
 from shared import formats, program
@@ -12,12 +12,7 @@ a = puppet.actions
 t = puppet.tables
 def evaluate():
     {call}
-times = []
-for _ in range({frames}):
-    begun = time.ticks_us()
-    evaluate()
-    times.append(time.ticks_diff(time.ticks_us(), begun))
-print(times)
+print(frames(evaluate))
 """
 
 EVALUATE = (
@@ -26,7 +21,7 @@ EVALUATE = (
     "puppet._value_q15)"
 )
 EVALUATE_PROGRAMS = (
-    "puppet._programs.evaluate(t, a, puppet._sine, puppet.gradients, puppet._live_w_q28, puppet._value_q15)"
+    "puppet.programs.evaluate(t, a, puppet._sine, puppet.gradients, puppet._live_w_q28, puppet._value_q15)"
 )
 EVALUATE_BLINKS = "puppet.blinks.evaluate(t, a, puppet._sine, puppet._value_q15)"
 
@@ -93,7 +88,7 @@ def measure_functions(repl: RawRepl) -> list[Cost]:
 
     def times_us(stage: Stage, call: str) -> list[float]:
         play(repl, stage)
-        (times,) = numbers(repl.exec(MEASURE_CALL.format(call=call, frames=FRAMES), PATIENCE_US))
+        (times,) = numbers(repl.exec(MEASURE_CALL.format(call=call), PATIENCE_US))
         return [time_us / evaluations for time_us in times]
 
     costs = []

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from marotte.character import response
+from marotte.link import pack
 from marotte.mcu.raw_repl import RawRepl
 from marotte.puppet import Character
 from shared import formats, messages, program
@@ -25,6 +26,8 @@ ACCEL = 200.0
 CHARACTER = Character(f_hz=3.0, zeta=0.5, r=0.5)
 
 PATIENCE_US = 30_000_000
+START_US = 1_000_000
+"""What the firmware takes at most until it listens."""
 
 FUNCTIONS = (
     (formats.FUNCTION_NOISE, None),
@@ -41,26 +44,50 @@ BLINK_GAP_Q18 = 1 << 18
 _ARGUMENTS = {formats.FUNCTION_NOISE: formats.NOISE_TABLES}
 
 
-SETUP = """
+SETUP = f"""
+room.clear()
 import array, gc, micropython, time
+gc.collect()
 from firmware import actions, clock, compositor, functions, weights
 from firmware.board_rp2040 import Board
+from firmware.cues import GAIN, WEIGHT
 from firmware.puppet import Puppet
 board = Board()
 puppet = Puppet(board)
 staged = puppet.staged
+took_us = array.array("i", range({FRAMES}))
+def nothing():
+    pass
+def catch_up():
+    while puppet.future.pending:
+        puppet.prepare()
+def frames(call, afterwards=nothing):
+    gc.collect()
+    micropython.heap_lock()
+    for n in range({FRAMES}):
+        begun = time.ticks_us()
+        call()
+        took_us[n] = time.ticks_diff(time.ticks_us(), begun)
+        afterwards()
+    micropython.heap_unlock()
+    return list(took_us)
+def tell(kind, body, count):
+    assert puppet.cues.put(kind, body, 0, len(body), count) == 0
 """
+"""While a call is timed the heap is locked, as it is in the main loop: else MicroPython looks there for room for the locals of
+larger functions. `catch_up` does the work between frames."""
 
 PLAY = """
 puppet.stop()
 puppet.commit()
 staged = puppet.staged
 puppet.start()
+catch_up()
 board.stop_ticks()
-for action in range({playing}):
-    puppet.actions.target_q28[action] = (1 << 28) - 1000 * action
+tell(WEIGHT, {targets}, {actions})
 for _ in range(60):
     puppet.step()
+    catch_up()
 """
 
 
@@ -84,35 +111,43 @@ def numbers(printed: str) -> list[list[float]]:
 
 @dataclass(frozen=True)
 class Stage:
-    """So many actions with MAPPINGS mappings each; `functions` as FUNCTIONS. Programs differ only in their last constant."""
+    """So many actions with `mappings` mappings each; `functions` as FUNCTIONS. Programs differ only in their last constant."""
 
-    actions: int
+    actions: int = ACTIONS
     functions: Sequence[tuple[int, int | None]] = FUNCTIONS
     words: Sequence[int] = (program.CONST, 0)
     motor_period_us: int = formats.MOTOR_PERIOD_MAX_US
     has_characters: bool = False
+    playing: int = PLAYING
+    dofs: int = DOFS
+    mappings: int = MAPPINGS
+    rate_hz: int = RATE_HZ
+
+    def targets(self, weight: float = 1.0) -> dict[int, int]:
+        """Return weight targets for those that play, all different."""
+        return {action: round(weight * formats.WEIGHT_ONE) - 1000 * action for action in range(self.playing)}
 
     def messages(self) -> Iterator[tuple[str, dict[str, int], list[dict[str, int]]]]:
         """Yield the upload's messages in their order."""
         alpha_q26 = formats.ALPHA_ONE >> 3
         kinds = {kind for kind, _ in self.functions}
-        curves = MAPPINGS if formats.FUNCTION_CURVE in kinds or program.CURVE in self.words else 0
-        programs = MAPPINGS if formats.FUNCTION_PROGRAM in kinds else 0
-        blinks = MAPPINGS if kinds & {formats.FUNCTION_BLINK, formats.FUNCTION_RTRIGSIN} else 0
+        curves = self.mappings if formats.FUNCTION_CURVE in kinds or program.CURVE in self.words else 0
+        programs = self.mappings if formats.FUNCTION_PROGRAM in kinds else 0
+        blinks = self.mappings if kinds & {formats.FUNCTION_BLINK, formats.FUNCTION_RTRIGSIN} else 0
         # fmt: off
         yield _message(
-            "begin", RATE_HZ, DOFS, self.actions, self.actions * MAPPINGS, 1, curves, programs, blinks, 1999, 0, alpha_q26, 500,
-            formats.SILENT_IDLE,
+            "begin", self.rate_hz, self.dofs, self.actions, self.actions * self.mappings, 1, curves, programs, blinks, 1999, 0,
+            alpha_q26, 500, formats.SILENT_IDLE,
         )
         # fmt: on
         yield _message("robot", self.motor_period_us, 0, formats.NO_PIN, 0, 0)
         tick_s = self.motor_period_us * 1e-6
         speed_q24 = int(SPEED * tick_s * formats.POSITION_ONE)
         accel_q24 = int(ACCEL * tick_s**2 * formats.POSITION_ONE)
-        for dof in range(DOFS):
-            limits = (0, formats.VALUE_ONE, speed_q24, accel_q24)
+        for dof in range(self.dofs):
+            limits = (0, formats.VALUE_ONE, speed_q24, accel_q24, int(blinks == 0))
             yield _message("dof", dof, formats.KIND_ABSOLUTE, formats.VALUE_ONE // 2, *limits)
-        for dof in range(DOFS):
+        for dof in range(self.dofs):
             if self.has_characters:
                 yield "character", {"dof": dof, **response(CHARACTER, tick_s).fixed()}, []
             output = _message("output", dof, formats.DRIVER_PINS, 1, 16000, 32000, 0, formats.VALUE_ONE)
@@ -120,13 +155,15 @@ class Stage:
         for action in range(self.actions):
             tempo_q16 = 50000 + 7 * action
             entry = (formats.ENTRY_START, alpha_q26, 0)
-            yield _message("action", action, tempo_q16, alpha_q26, alpha_q26, MAPPINGS * action, MAPPINGS, *entry)
+            yield _message(
+                "action", action, tempo_q16, alpha_q26, alpha_q26, self.mappings * action, self.mappings, *entry
+            )
         items = [name for name, _ in messages.find(messages.MAPPINGS)[3]]
         for action in range(self.actions):
-            values = [self._mapping(action, number) for number in range(MAPPINGS)]
+            values = [self._mapping(action, number) for number in range(self.mappings)]
             entries = [dict(zip(items, entry, strict=True)) for entry in values]
-            yield "mappings", {"first_mapping": MAPPINGS * action}, entries
-        yield _message("live", 0, formats.WEIGHT_ONE // 2, alpha_q26, alpha_q26)
+            yield "mappings", {"first_mapping": self.mappings * action}, entries
+        yield _message("live", 0, formats.WEIGHT_ONE // 2, alpha_q26, alpha_q26, formats.PREDICT_HOLD, 0, 0, 0)
         for curve in range(curves):
             samples = [{"value_q15": 500 * n + curve} for n in range(CURVE_SAMPLES)]
             yield "curve", {"curve": curve, "samples": CURVE_SAMPLES}, samples
@@ -140,8 +177,8 @@ class Stage:
     def _mapping(self, action: int, number: int) -> tuple[int, ...]:
         code, argument = self.functions[number % len(self.functions)]
         if argument is None:
-            argument = (action + number) % _ARGUMENTS.get(code, MAPPINGS)
-        return (action + number) % DOFS, code, argument, 100 * action, formats.VALUE_ONE - 500 * number
+            argument = (action + number) % _ARGUMENTS.get(code, self.mappings)
+        return (action + number) % self.dofs, code, argument, 100 * action, formats.VALUE_ONE - 500 * number
 
 
 def load(repl: RawRepl, stage: Stage) -> None:
@@ -177,4 +214,17 @@ def _message(name: str, *values: int) -> tuple[str, dict[str, int], list[dict[st
 def play(repl: RawRepl, stage: Stage) -> None:
     """Load a stage on the MCU and play it until all weights are there."""
     load(repl, stage)
-    repl.exec(PLAY.format(playing=PLAYING), PATIENCE_US)
+    repl.exec(PLAY.format(targets=weight_targets(stage.targets()), actions=stage.actions), PATIENCE_US)
+
+
+def start_firmware(repl: RawRepl, code: str) -> None:
+    """Start code that calls `perform`, and wait until the host may speak: before that a byte 3 would be taken for Ctrl-C."""
+    repl.exec("room.clear()\nimport gc, micropython\ngc.collect()")
+    repl.start("micropython.kbd_intr(-1)\n" + code)
+    repl.mcu.run_for(START_US)
+
+
+def weight_targets(targets_q28: dict[int, int]) -> bytes:
+    """Return the payload that sets weight targets at once."""
+    items = [{"action": action, "target_q28": target} for action, target in targets_q28.items()]
+    return pack("weight_targets", {"frame": formats.FRAME_NOW}, items)

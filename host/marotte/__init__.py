@@ -9,6 +9,11 @@ Render a score on an emulated MCU, in virtual time, with the firmware that runs 
     rendering = marotte.render(puppet, score, seconds=20, mcu="unix")
     print(max(rendering.motor["HEAD_YAW"]))
 
+Draw it (this needs matplotlib):
+
+    rendering = marotte.render(puppet, score, seconds=20, weights=True)
+    marotte.save_figure(marotte.plot(rendering, score, ["NECK", "HEAD_YAW"]), "pet.png")
+
 Direct a robot by hand:
 
     robot = marotte.load_robot("puppets/pet-robot.toml", puppet)
@@ -41,6 +46,7 @@ can do something about raises a subclass of `MarotteError`, whose text is comple
 from marotte.curves import ImportedCurve, import_curve
 from marotte.errors import MarotteError
 from marotte.link import LinkError, VirtualCarrier
+from marotte.plotting import plot, save_figure
 from marotte.ports import PortError, SerialCarrier, available
 from marotte.puppet import Puppet
 from marotte.puppet_file import load_puppet
@@ -77,6 +83,8 @@ __all__ = [
     "load_puppet",
     "load_robot",
     "load_score",
+    "plot",
     "render",
+    "save_figure",
     "weight_q28",
 ]

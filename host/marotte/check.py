@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from marotte.bands import centres_hz, hertz
 from marotte.limits import LimitsInUse
-from marotte.puppet import Dof, Puppet
+from marotte.puppet import NEUTRAL_GAINS, Dof, Puppet
 from marotte.puppet_file import read_puppet
 from marotte.score import read_score
 from marotte.tables import build_tables
@@ -93,6 +94,20 @@ def describe(robot: Robot, puppet: Puppet | None) -> list[str]:
     return lines
 
 
+def describe_bands(puppet: Puppet) -> list[str]:
+    """Return the bands of signal processing at a puppet's frame rate, and what its moods do with them."""
+    rows = [("bands, in Hz", *map(hertz, centres_hz(puppet.frame_rate_hz)), "")]
+    for mood in puppet.moods.values():
+        tempo = f"tempo {mood.tempo:g}" if mood.tempo is not None else ""
+        rows.append((f"gains of {mood.name}", *(f"{gain:g}" for gain in mood.gains or NEUTRAL_GAINS), tempo))
+    first, *columns = (max(map(len, column)) for column in zip(*rows, strict=True))
+    lines = []
+    for name, *cells, tempo in rows:
+        gains = "  ".join(cell.rjust(width) for cell, width in zip(cells, columns[:-1], strict=True))
+        lines.append(f"  {name.ljust(first)}  {gains}  {tempo}".rstrip())
+    return lines
+
+
 def _limits(limits: LimitsInUse, dof: Dof) -> str:
     low, high = limits.range
     speed = "" if dof.is_relative else f", speed {limits.speed:g}"
@@ -109,6 +124,8 @@ def _check_puppet(path: Path, report: CheckReport) -> Puppet:
         _count(puppet.moods, "mood"),
     ]
     _note(report, path, mistakes, "a puppet with " + ", ".join(parts))
+    if not mistakes:
+        report.fine += describe_bands(puppet)
     return puppet
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from marotte import check, commands, curves, emulated
+from marotte import check, commands, curves, emulated, plotting, ports
 from marotte.errors import MarotteError
 from marotte.files import Watch, load, load_pair
 from marotte.tomlfile import FileMistakes, did_you_mean
@@ -60,8 +60,10 @@ def _parser() -> argparse.ArgumentParser:
         prog="marotte", description="Puppets that live on their own microcontroller, directed over a serial link."
     )
     commands_ = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in (_add_check, _add_render, _add_run, _add_save, _add_calibrate, _add_ports, _add_mcu, _add_import_curve):
+    for add in (_add_check, _add_render, _add_plot, _add_run, _add_save, _add_calibrate, _add_ports, _add_mcu):
         add(commands_)
+    _add_import_curve(commands_)
+    _add_link(commands_)
     return parser
 
 
@@ -115,6 +117,26 @@ def _add_render(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--out", required=True, metavar="FILE.csv", help="the file to write")
 
 
+def _add_plot(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands_,
+        "plot",
+        "play a score on an emulated MCU in virtual time and draw DOFs, their spectra and the weights",
+        _plot,
+        "marotte plot puppets/pet.toml --score puppets/pet-score.toml --seconds 20 --out pet.png",
+        "marotte plot puppets/pet.toml --score puppets/pet-score.toml --seconds 20 --dof NECK HEAD_YAW --out neck.svg",
+    )
+    _add_files(parser)
+    parser.add_argument("--seconds", type=_seconds, required=True, help="length of the rendering")
+    parser.add_argument(
+        "--dof", nargs="+", metavar="NAME", help=f"the DOFs to draw (default: the {plotting.DOFS} that move most)"
+    )
+    parser.add_argument(
+        "--mcu", choices=emulated.KINDS, default="unix", help="the emulated MCU to render on (default: %(default)s)"
+    )
+    parser.add_argument("--out", type=_picture, required=True, metavar="FILE.png|.svg", help="the file to write")
+
+
 def _add_run(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = _command(
         commands_,
@@ -134,6 +156,9 @@ def _add_run(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         "--watch", action="store_true", help="load the files again when they change, and play on with them"
     )
     parser.add_argument("--no-view", action="store_true", help="print a line a cue instead of the moving picture")
+    parser.add_argument(
+        "--capture", type=Path, metavar="FILE", help="write down what goes over the link (see `marotte link`)"
+    )
 
 
 def _add_save(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -229,6 +254,54 @@ def _add_import_curve(commands_: argparse._SubParsersAction[argparse.ArgumentPar
     )
 
 
+def _add_link(commands_: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands_.add_parser(
+        "link",
+        help="show, repeat and measure what went over the link",
+        description="Show, repeat and measure what went over the link, from a capture.",
+        epilog="example:\n  marotte link dump run.capture     after: marotte run ... --capture run.capture",
+        formatter_class=_Formatter,
+    )
+    tools = parser.add_subparsers(title="tools", metavar="TOOL", required=True)
+    _add_capture(
+        _command(
+            tools,
+            "dump",
+            "print each packet of a capture with its time, direction, number, message and fields",
+            _link_dump,
+            "marotte link dump run.capture | less",
+            "tail -f -n +1 run.capture | marotte link dump -       while it is being captured",
+        )
+    )
+    replay = _command(
+        tools,
+        "replay",
+        "send the host's half of a capture to an MCU again, and see whether it answers and moves as in the capture",
+        _link_replay,
+        "marotte link replay run.capture --mcu unix",
+        "marotte link replay run.capture --mcu rp2040 --robot puppets/pet-robot.toml",
+        "marotte link replay run.capture --port /dev/ttyACM0   it moves as it did: outputs are armed if they were",
+    )
+    _add_capture(replay)
+    _add_where(replay)
+    replay.add_argument("--robot", help="the robot file: its chips and kill switch are connected to the emulated MCU")
+    stats = _command(
+        tools,
+        "stats",
+        "count packets, bytes and errors of a capture, and measure its round trips",
+        _link_stats,
+        "marotte link stats run.capture",
+    )
+    _add_capture(stats)
+    stats.add_argument(
+        "--baud", type=_baud, default=ports.BAUD, help="the line's rate, to tell shares of it (default: %(default)d)"
+    )
+
+
+def _add_capture(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("capture", metavar="FILE", help="a capture of `marotte run --capture`, or - for standard input")
+
+
 def _add_files(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("puppet", metavar="PUPPET", help="the puppet file")
     parser.add_argument("--score", required=True, help="the score file")
@@ -244,6 +317,14 @@ def _seconds(text: str) -> Fraction:
     if seconds is None or not 0 < seconds <= SECONDS_MAX:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a number of seconds above 0")
     return seconds
+
+
+def _picture(text: str) -> Path:
+    if Path(text).suffix.lower() not in plotting.SUFFIXES:
+        raise argparse.ArgumentTypeError(
+            f"found {text!r}, expected a name that ends in {' or '.join(plotting.SUFFIXES)}"
+        )
+    return Path(text)
 
 
 def _frame_rate(text: str) -> float:
@@ -266,6 +347,12 @@ def _function_name(text: str) -> str:
     if not curves.is_function_name(text):
         raise argparse.ArgumentTypeError(f"found {text!r}, expected letters, digits and _, and no primitive's name")
     return text
+
+
+def _baud(text: str) -> int:
+    if not text.isdecimal() or not 1 <= len(text) <= 9 or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected bits a second")
+    return int(text)
 
 
 def _tcp_port(text: str) -> int:
@@ -292,6 +379,18 @@ def _render(options: argparse.Namespace) -> int:
     return FINE
 
 
+def _plot(options: argparse.Namespace) -> int:
+    if not plotting.is_possible():
+        return _failed(f"marotte: {plotting.MISSING}", MISTAKE)
+    files = load(options.puppet, options.score, options.robot)
+    for name in options.dof or ():
+        if name not in files.puppet.dofs:
+            hint = did_you_mean(name, files.puppet.dofs)
+            return _failed(f"marotte: {options.puppet} has no DOF {name!r}{hint}", MISTAKE)
+    commands.plot_to_file(files, options.seconds, options.mcu, options.dof, options.out, Console(stderr=True))
+    return FINE
+
+
 def _run(options: argparse.Namespace) -> int:
     if options.arm and not options.robot:
         return _failed("marotte: --arm needs --robot FILE, which says where the outputs are", MISTAKE)
@@ -299,12 +398,30 @@ def _run(options: argparse.Namespace) -> int:
     watch = Watch(*paths) if options.watch else None
     files = load(*paths)
     console = Console()
-    how = commands.RunOptions(options.arm, options.seconds, options.no_view, watch)
+    how = commands.RunOptions(options.arm, options.seconds, options.no_view, watch, options.capture)
     if options.port:
         interrupted = commands.run_on_port(files, options.port, how, console)
     else:
         interrupted = commands.run_on_mcu(files, options.mcu, how, console)
     return INTERRUPTED if interrupted else FINE
+
+
+def _link_dump(options: argparse.Namespace) -> int:
+    commands.dump_capture(options.capture)
+    return FINE
+
+
+def _link_replay(options: argparse.Namespace) -> int:
+    if options.robot and not options.mcu:
+        return _failed("marotte: --robot is for an emulated MCU, --mcu", MISTAKE)
+    robot = load_robot(options.robot) if options.robot else None
+    agrees = commands.replay_capture(options.capture, commands.Where(options.port, options.mcu or ""), robot)
+    return FINE if agrees else FAILURE
+
+
+def _link_stats(options: argparse.Namespace) -> int:
+    commands.print_stats(options.capture, options.baud)
+    return FINE
 
 
 def _save(options: argparse.Namespace) -> int:

@@ -6,10 +6,11 @@ import contextlib
 import queue
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -17,10 +18,12 @@ from rich.table import Table
 
 from marotte import ports
 from marotte.calibration import Calibration, CalibrationError
+from marotte.capture import STANDARD_INPUT, CapturingCarrier, read_capture
 from marotte.emulated import connected, open_mcu, without_feedback
 from marotte.errors import MarotteError
 from marotte.files import Files, Watch
 from marotte.link import Carrier, LinkError, VirtualCarrier
+from marotte.link_tools import dump, replay, stats, stats_text
 from marotte.outputs import Output
 from marotte.ports import SerialCarrier
 from marotte.pulses import PulseSummary, measure
@@ -31,6 +34,9 @@ from marotte.tables import build_tables
 from marotte.view import View
 from marotte.wiring import Robot
 
+if TYPE_CHECKING:
+    from marotte.rendering import Rendering
+
 PUMP_US = 20_000
 GONE = {"rest": "goes to rest", "relax": "goes to rest and lets go"}
 """What a puppet does when the host is gone, by its `when_silent`; with any other it goes on."""
@@ -38,9 +44,34 @@ GONE = {"rest": "goes to rest", "relax": "goes to rest and lets go"}
 
 def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console: Console) -> None:
     """Render into a file, with a progress bar, and tell about the run. Raises MarotteError."""
-    from marotte.rendering import frame_count, render
+    _require_writable(out)
+    rendering = _render(files, seconds, mcu, console)
+    rendering.write_csv(out)
+    print(f"{out}: {len(rendering.frames)} frames, {len(files.puppet.dofs)} DOFs")
+    for key, value in rendering.report.items():
+        print(f"  {key}: {value:,}" if isinstance(value, int) else f"  {key}: {value}")
+    if rendering.status["clipped"]:
+        print(f"  {clipping(rendering.status)}")
+
+
+def plot_to_file(
+    files: Files, seconds: Fraction, mcu: str, dofs: Sequence[str] | None, out: Path, console: Console
+) -> None:
+    """Render, with a progress bar, and draw it into a PNG or SVG file. Raises MarotteError."""
+    from marotte.plotting import plot, save_figure
 
     _require_writable(out)
+    rendering = _render(files, seconds, mcu, console, weights=True)
+    with console.status("drawing") if console.is_terminal else contextlib.nullcontext():
+        save_figure(plot(rendering, files.score, dofs), out)
+    print(f"{out}: {len(rendering.frames)} frames")
+    if rendering.status["clipped"]:
+        print(f"  {clipping(rendering.status)}")
+
+
+def _render(files: Files, seconds: Fraction, mcu: str, console: Console, weights: bool = False) -> Rendering:
+    from marotte.rendering import frame_count, render
+
     bar = Progress(
         TextColumn("rendering on {task.description}"),
         BarColumn(),
@@ -52,18 +83,20 @@ def render_to_csv(files: Files, seconds: Fraction, mcu: str, out: Path, console:
     )
     with bar:
         task = bar.add_task(mcu, total=frame_count(seconds, files.puppet.frame_rate_hz))
-        rendering = render(
+        return render(
             files.puppet,
             files.score,
             seconds,
             mcu,
             files.robot,
             progress=lambda done, of: bar.update(task, completed=done, total=of),
+            weights=weights,
         )
-    rendering.write_csv(out)
-    print(f"{out}: {len(rendering.frames)} frames, {len(files.puppet.dofs)} DOFs")
-    for key, value in rendering.report.items():
-        print(f"  {key}: {value:,}" if isinstance(value, int) else f"  {key}: {value}")
+
+
+def clipping(status: dict[str, int]) -> str:
+    """Return how often signal processing went out of the range of a DOF, as a status says."""
+    return f"{status['clipped']:,} values clipped by signal processing: the gains are high for where the motion is"
 
 
 @dataclass(frozen=True)
@@ -74,11 +107,15 @@ class RunOptions:
     seconds: Fraction | None = None
     no_view: bool = False
     watch: Watch | None = None
+    capture: Path | None = None
+    """The file that what goes over the link is written to."""
 
 
 def run_on_port(files: Files, port: str, options: RunOptions, console: Console) -> bool:
     """Play live on a port; return whether the user ended it. Raises MarotteError."""
-    carrier = SerialCarrier(port)
+    if options.capture:
+        _require_writable(options.capture)
+    carrier = _captured(SerialCarrier(port), options.capture)
     try:
         return _perform(files, carrier, port, options, console)
     finally:
@@ -89,6 +126,8 @@ def run_on_mcu(files: Files, mcu: str, options: RunOptions, console: Console) ->
     """Play live on an emulated MCU and show the pulses of its pins; return whether the user ended it. Raises MarotteError."""
     from marotte.mcu.serve import serve
 
+    if options.capture:
+        _require_writable(options.capture)
     with contextlib.ExitStack() as stack:
         virtual = stack.enter_context(open_mcu(mcu))
         if files.robot:
@@ -96,7 +135,7 @@ def run_on_mcu(files: Files, mcu: str, options: RunOptions, console: Console) ->
         if options.watch:
             options.watch.adapt = without_feedback
         live = stack.enter_context(serve(virtual))
-        carrier = SerialCarrier(live.url)
+        carrier = _captured(SerialCarrier(live.url), options.capture)
         try:
             interrupted = _perform(files, carrier, f"emulated {mcu} at {live.url}", options, console)
         finally:
@@ -240,7 +279,39 @@ def list_ports() -> None:
         print("no serial port found (is the robot plugged in?)")
 
 
-def _perform(files: Files, carrier: SerialCarrier, where: str, options: RunOptions, console: Console) -> bool:
+def dump_capture(path: str) -> None:
+    """Print the packets of a capture. Raises MarotteError."""
+    for line in dump(read_capture(path)):
+        print(line, flush=path == STANDARD_INPUT)
+
+
+def replay_capture(path: str, where: Where, robot: Robot | None) -> bool:
+    """Send the host's half of a capture to an MCU, print and return whether it did as in the capture. Raises MarotteError."""
+    records = list(read_capture(path))
+    with _carrier(where) as (carrier, name):
+        if robot and isinstance(carrier, VirtualCarrier):
+            connected(carrier.mcu, robot)
+        result = replay(records, carrier)
+    for difference in result.differences:
+        print(difference)
+    how = "as" if result.agrees else "not as"
+    print(
+        f"{name} did {how} in the capture: {result.packets} packets sent, {result.answers} commands answered alike, "
+        f"{result.frames} frames alike"
+    )
+    return result.agrees
+
+
+def print_stats(path: str, baud: int) -> None:
+    """Print the figures of a capture. Raises MarotteError."""
+    print(stats_text(stats(read_capture(path)), baud))
+
+
+def _captured(carrier: Carrier, path: Path | None) -> Carrier:
+    return CapturingCarrier(carrier, path) if path else carrier
+
+
+def _perform(files: Files, carrier: Carrier, where: str, options: RunOptions, console: Console) -> bool:
     from marotte.run import default_seconds, perform
 
     arm, seconds = options.arm, options.seconds
@@ -263,7 +334,8 @@ def _perform(files: Files, carrier: SerialCarrier, where: str, options: RunOptio
     how = "stopped by hand" if performance.is_interrupted else "played"
     late = f", {status['late_frames']} late, at most {status['late_max_us']} us" if status else ""
     errors = f"; {status['bus_errors']} errors on the I2C bus" if status.get("bus_errors") else ""
-    console.print(f"{how}: {performance.frames} frames{late}{errors}; outputs are off", highlight=False)
+    clipped = f"; {clipping(status)}" if status.get("clipped") else ""
+    console.print(f"{how}: {performance.frames} frames{late}{errors}{clipped}; outputs are off", highlight=False)
     return performance.is_interrupted
 
 

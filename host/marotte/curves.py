@@ -20,12 +20,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from marotte.functions import PRIMITIVES
+from marotte.textfile import UnreadableError, read_text
 from marotte.tomlfile import FileMistakes, Mistake, did_you_mean, is_identifier
 from shared import formats
 
 FRAME_RATE_HZ = 24.0
 """Of the tool, if nobody says: Blender's."""
 FRAME_RATE_MAX_HZ = 1000
+BYTES_MAX = 4 << 20
+"""Of a file: some hours of every frame."""
 DIGITS = 5
 
 _TIMES = ("time", "seconds", "t", "time_s", "time (s)")
@@ -33,6 +36,8 @@ _FRAMES = ("frame", "frames", "frame_number")
 _GRID = 4096
 _PER_LINE = 12
 _MISTAKES_MAX = 20
+_NAMES_SHOWN = 20
+_NAME_SHOWN = 40
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,8 @@ def import_curve(
     if count < 2 or low == high:
         what = f"has {count} row in a period of {period_s:g} s" if count < 2 else f"is {low:g} throughout"
         raise _mistake(path, None, column, f"{what}, expected a curve")
+    if not math.isfinite(high - low):
+        raise _mistake(path, None, column, f"is {low:g} to {high:g}, expected values that are nearer together")
     shares = [(value - low) / (high - low) for value in values]
     size = samples or min(count, formats.SAMPLES_MAX)
     table = tuple(round(_straight(phases, shares, index / size), DIGITS) for index in range(size))
@@ -129,11 +136,22 @@ def _straight(phases: list[float], values: list[float] | tuple[float, ...], phas
 
 def _read(path: Path, column: str, period_s: float, frame_rate_hz: float) -> tuple[list[float], list[float]]:
     """Return the times in seconds, increasing, and the values of a column."""
-    lines = _lines(path)
+    try:
+        return _columns(path, _lines(path), column, period_s, frame_rate_hz)
+    except csv.Error as error:
+        raise _mistake(path, None, "", f"is no table of cells: {error}") from None
+
+
+def _columns(
+    path: Path, lines: list[str], column: str, period_s: float, frame_rate_hz: float
+) -> tuple[list[float], list[float]]:
     delimiter = max(",;\t", key=lines[0].count) if lines else ","
     header = [cell.strip() for cell in next(csv.reader(lines[:1], delimiter=delimiter), [])]
     if column not in header:
-        hint = did_you_mean(column, header) or f"; expected one of {', '.join(header)}"
+        hint = (
+            did_you_mean(column, header)
+            or f"; expected one of {', '.join(name[:_NAME_SHOWN] for name in header[:_NAMES_SHOWN])}"
+        )
         raise _mistake(path, 1 if header else None, column, f"there is no such column{hint}")
     clock = [index for index, name in enumerate(header) if name.lower() in (*_TIMES, *_FRAMES)]
     per_s = frame_rate_hz if clock and header[clock[0]].lower() in _FRAMES else 1.0
@@ -142,6 +160,8 @@ def _read(path: Path, column: str, period_s: float, frame_rate_hz: float) -> tup
     values: list[float] = []
     rows = csv.reader(lines[1:], delimiter=delimiter)
     for row in rows:
+        if len(mistakes) >= _MISTAKES_MAX:
+            break
         if not any(cell.strip() for cell in row):
             continue
         line = rows.line_num + 1
@@ -160,7 +180,7 @@ def _read(path: Path, column: str, period_s: float, frame_rate_hz: float) -> tup
             times_s.append(time_s)
             values.append(numbers[header.index(column)])
     if mistakes:
-        raise FileMistakes(mistakes[:_MISTAKES_MAX])
+        raise FileMistakes(mistakes)
     if not values:
         raise _mistake(path, None, column, "has no row, expected at least two")
     if not clock:
@@ -170,12 +190,9 @@ def _read(path: Path, column: str, period_s: float, frame_rate_hz: float) -> tup
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise _mistake(path, None, "", "found bytes that are no text, expected a CSV file in UTF-8") from None
-    except (OSError, ValueError) as error:
-        why = (getattr(error, "strerror", None) or str(error)).lower()
-        raise _mistake(path, None, "", f"cannot be read: {why}") from None
+        return read_text(path, "utf-8-sig", BYTES_MAX).splitlines()
+    except UnreadableError as error:
+        raise _mistake(path, None, "", str(error)) from None
 
 
 def _number(cell: str, delimiter: str) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import Any
 
 from marotte import functions
@@ -11,6 +12,7 @@ from marotte.puppet import Curve
 from marotte.tomlfile import Document, Table, check_number, found, is_identifier
 from shared import formats
 
+FUNCTIONS_MAX = 512
 SAMPLES_RANGE = (2, formats.SAMPLES_MAX)
 
 
@@ -25,6 +27,9 @@ class FunctionReader:
     def curves(self, root: Table) -> dict[str, Curve]:
         """Return the `[function.NAME]`s in the file's order; tables are read first, as expressions may name them."""
         tables = dict(root.tables("function"))
+        if len(tables) > FUNCTIONS_MAX:
+            root.mistake(f"has {len(tables)} functions, expected at most {FUNCTIONS_MAX}", "function")
+            tables = dict(islice(tables.items(), FUNCTIONS_MAX))
         curves = {}
         for name in sorted(tables, key=lambda name: tables[name].has("expr")):
             curves[name] = self.curve(name, tables[name])

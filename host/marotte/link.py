@@ -4,9 +4,8 @@
 real time over a serial port and in virtual time with an emulated MCU.
 
 Commands are numbered and carried out by the MCU in their order, each once; up to WINDOW of them, and of WINDOW_BYTES
-unless a single one has more, are under way. What is
-not acknowledged within RETRY_US is sent again, with all that follow it. Telemetry is not acknowledged: what is lost of
-it is lost.
+unless a single one has more, are under way. What is not acknowledged within RETRY_US is sent again, one at a time; what is known
+to be lost, since a later one has been answered, at once. Telemetry is not acknowledged: what is lost of it is lost.
 """
 
 from __future__ import annotations
@@ -33,12 +32,26 @@ rate of 333 Hz half as much again. With no more on the way, a `kill` that overta
 PAYLOAD_SENT_MAX = 80
 """Longest payload that is sent, so that a packet alone does not take longer than that."""
 
-RETRY_US = 100_000
+RETRY_US = 40_000
+"""When a line works again the first answer comes within this and the time it takes, and the MCU counts as found within 100 ms. It
+is more than what an MCU that plays is busy with otherwise.
+"""
 HURRY_US = 5_000
 """A gap that the MCU reports is filled at once, but not twice within this: all that follow it report it too."""
 
+CTRL_C = 3
+CTRL_D = 4
+_ERASERS = b"\x03\x08\x0b\r\x0e\x15\x17\x7f"
+"""What ends or empties a line in MicroPython's REPL; Ctrl-D on an empty one restarts the MCU."""
+
 SILENT_US = 1_000_000
-"""With commands under way and no packet for so long, the MCU counts as gone."""
+"""With commands under way and no packet, or no answer to any of them, for so long, the MCU counts as gone."""
+
+STALE_US = 20_000
+"""The beginning of a packet is dropped if the line is still for so long behind it: its end was lost."""
+
+ASLEEP_US = 500_000
+"""A host that has not looked for so long, as it was suspended, knows nothing of what was to be heard meanwhile."""
 
 WIRE_OVERHEAD = codec.OVERHEAD + 2
 """What a packet has on the wire beside its payload."""
@@ -60,6 +73,10 @@ class LinkError(MarotteError):
 
 class LinkSilent(LinkError):
     """Nothing, or nothing that is a packet, has come for too long."""
+
+
+class LinkTaken(LinkSilent):
+    """The MCU can be heard, but it does not answer this session."""
 
 
 class LinkRefused(LinkError):
@@ -135,8 +152,10 @@ class _Command:
     on_refused: Callable[[int, int], None] | None
     seq: int = 0
     packet: bytes = b""  # made when it is sent, and numbered then
+    urgent: bool = False
     sent_us: int = 0
     repeated: bool = False
+    answer: tuple[int, int] | None = None  # status and detail, while one before it has none
 
 
 def pack(name: str, fields: dict[str, int], items: list[dict[str, int]] | None = None) -> bytes:
@@ -170,18 +189,32 @@ def wire_packet(message_id: int, seq: int, payload: bytes) -> bytes:
     return bytes(wire[: codec.encode(body, length, wire)])
 
 
+def _is_harmless(greeting: bytes) -> bool:
+    """Return whether a greeting neither interrupts MicroPython's start, nor restarts it from its REPL.
+
+    The first byte of most is Ctrl-D, as the fourth of their bodies is a zero: each has to leave text on the REPL's line for the next.
+    """
+    rest = greeting[1:]
+    text = rest[max(map(rest.rfind, _ERASERS)) + 1 :]
+    return CTRL_C not in greeting and CTRL_D not in rest and any(32 <= byte < 127 for byte in text)
+
+
 class Link:
     """Commands out, messages in. `on_message` is called with every message but acknowledgements."""
 
     def __init__(self, carrier: Carrier, on_message: Callable[[Message], None]):
         self.counters = Counters()
         self.heard_us = carrier.now_us()
+        self._answered_us = self._pumped_us = self.heard_us
         self._carrier = carrier
         self._on_message = on_message
         self._seq = 0
         self._backlog: deque[_Command] = deque()
         self._under_way: deque[_Command] = deque()
         self._partial = b""
+        self._is_stale = False  # whether the line has been still behind that
+        self._byte_us = self.heard_us
+        self._tail = b""
         self._refusals: deque[LinkRefused] = deque()
 
     @property
@@ -191,8 +224,8 @@ class Link:
 
     @property
     def tail(self) -> bytes:
-        """The last bytes that have come and are no packet yet, at most 1 KB of them."""
-        return self._partial
+        """The last bytes that have come, at most 1 KB of them."""
+        return self._tail
 
     def post(
         self,
@@ -207,7 +240,7 @@ class Link:
 
         `on_refused(status, detail)` is called if the MCU refuses it; without, `pump` raises LinkRefused.
         """
-        command = _Command(name, pack(name, fields or {}, items), on_refused)
+        command = _Command(name, pack(name, fields or {}, items), on_refused, urgent=urgent)
         if urgent and len(self._under_way) < URGENT_WINDOW:
             self._carrier.write(b"\0")  # the end of whatever has lost its own
             self._send(command)
@@ -215,25 +248,30 @@ class Link:
             self._backlog.append(command)
             self._send_what_fits()
 
-    def withdraw(self, name: str) -> None:
-        """Drop the commands of this name that have not been sent yet."""
-        self._backlog = deque(command for command in self._backlog if command.name != name)
+    def withdraw(self, name: str, is_meant: Callable[[Message], bool] = lambda message: True) -> None:
+        """Drop the commands of this name that have not been sent yet, or those of them that are meant."""
+        message_id = _BY_NAME[name][1]
+        self._backlog = deque(
+            command
+            for command in self._backlog
+            if command.name != name or not (message := unpack(message_id, command.payload)) or not is_meant(message)
+        )
 
     def pump(self, wait_us: int) -> None:
         """Let at most `wait_us` pass; take what has come, repeat what was lost. Raises LinkSilent and LinkRefused."""
+        begun_us = self._carrier.now_us()
+        slept = begun_us - self._pumped_us > ASLEEP_US
         data = self._carrier.read(wait_us)
+        now_us = self._pumped_us = self._carrier.now_us()
         if data:
-            self.counters.bytes += len(data)
-            *packets, self._partial = (self._partial + data).split(b"\0")
-            self._partial = self._partial[-4 * codec.WIRE_MAX :]
-            for packet in packets:
-                self._take(packet)
-        now_us = self._carrier.now_us()
+            self._take_bytes(data)
+            self._byte_us = now_us
+        self._is_stale = not data and now_us - self._byte_us > STALE_US
+        if slept:
+            self.heard_us = self._answered_us = begun_us
         if self._under_way:
-            if now_us - self.heard_us > SILENT_US:
-                raise LinkSilent(f"the MCU has not answered for {SILENT_US / 1e6:g} s")
-            if now_us - self._under_way[0].sent_us > RETRY_US:
-                self._repeat(now_us)
+            self._check_answers(now_us)
+            self._repeat_late(now_us)
         self._send_what_fits()
         if self._refusals:  # raised when all else is done, so that nothing that has come is lost
             raise self._refusals.popleft()
@@ -253,23 +291,68 @@ class Link:
                 break
             self._send(self._backlog.popleft())
 
+    def _check_answers(self, now_us: int) -> None:
+        if now_us - self.heard_us > SILENT_US:
+            raise LinkSilent(f"the MCU has not answered for {SILENT_US / 1e6:g} s (unplugged, or reset?)")
+        if now_us - self._answered_us > SILENT_US:
+            raise LinkTaken(
+                f"the MCU can be heard, but has answered no command for {SILENT_US / 1e6:g} s: "
+                "does another program use this port, or is the line to the MCU broken?"
+            )
+
     def _send(self, command: _Command) -> None:
-        if not self._under_way:
-            self.heard_us = self._carrier.now_us()  # silence begins with the first command that waits for an answer
+        if not self._under_way:  # silence begins with the first command that waits for an answer
+            self.heard_us = self._answered_us = self._carrier.now_us()
+        message_id = _BY_NAME[command.name][1]
+        command.packet = wire_packet(message_id, self._seq, command.payload)
+        if command.name == "hello":
+            for seq in range(self._seq, self._seq + 256):
+                packet = wire_packet(message_id, seq & 255, command.payload)
+                if _is_harmless(packet):
+                    self._seq, command.packet = seq & 255, packet
+                    break
         command.seq = self._seq
-        command.packet = wire_packet(_BY_NAME[command.name][1], command.seq, command.payload)
         command.sent_us = self._carrier.now_us()
         self._seq = (self._seq + 1) & 255
         self._under_way.append(command)
         self._carrier.write(command.packet)
         self.counters.sent += 1
 
-    def _repeat(self, now_us: int) -> None:
-        for command in self._under_way:
-            command.sent_us = now_us
-            command.repeated = True
-            self._carrier.write(command.packet)
-            self.counters.repeated += 1
+    def _repeat_late(self, now_us: int) -> None:
+        """Repeat the first command if it has no answer for too long, as that tells of the rest, and those that are urgent."""
+        first = self._under_way[0]
+        for command in list(self._under_way):
+            if (command is first or command.urgent) and now_us - command.sent_us > RETRY_US:
+                self._repeat(command, now_us)
+
+    def _repeat_lost(self, last: _Command | None) -> None:
+        """Repeat what has no answer, up to `last`, but not twice within a moment."""
+        now_us = self._carrier.now_us()
+        first = self._under_way[0]
+        if first.repeated and now_us - first.sent_us <= HURRY_US:
+            return
+        for command in list(self._under_way):
+            if command is last:
+                break
+            if command.answer is None:
+                self._repeat(command, now_us)
+
+    def _repeat(self, command: _Command, now_us: int) -> None:
+        command.sent_us = now_us
+        command.repeated = True
+        self._carrier.write(command.packet)
+        self.counters.repeated += 1
+
+    def _take_bytes(self, data: bytes) -> None:
+        self.counters.bytes += len(data)
+        self._tail = (self._tail + data)[-4 * codec.WIRE_MAX :]
+        if self._is_stale and self._partial:
+            self.counters.damaged += 1
+            self._partial = b""
+        *packets, self._partial = (self._partial + data).split(b"\0")
+        self._partial = self._partial[-4 * codec.WIRE_MAX :]
+        for packet in packets:
+            self._take(packet)
 
     def _take(self, packet: bytes) -> None:
         if not packet:
@@ -292,14 +375,24 @@ class Link:
 
     def _acknowledged(self, seq: int, status: int, detail: int) -> None:
         if status == messages.RESEND:
-            now_us = self._carrier.now_us()
-            first = self._under_way[0] if self._under_way else None
-            if first and first.seq == detail & 255 and (not first.repeated or now_us - first.sent_us > HURRY_US):
-                self._repeat(now_us)
+            if self._found(detail & 255):
+                self._repeat_lost(None)
             return
-        if not self._under_way or self._under_way[0].seq != seq:
-            return  # answered before, or one before it is still missing: the repetition will tell
-        command = self._under_way.popleft()
+        command = self._found(seq)
+        if command is None or command.answer:
+            return  # answered before
+        command.answer = (status, detail)
+        self._answered_us = self._carrier.now_us()
+        while self._under_way and (answer := self._under_way[0].answer):
+            self._settle(self._under_way.popleft(), *answer)
+        if self._found(seq):
+            self._repeat_lost(command)  # the MCU has carried out all before it, so it is their answers that were lost
+
+    def _found(self, seq: int) -> _Command | None:
+        """Return the command under way that has this number."""
+        return next((command for command in self._under_way if command.seq == seq), None)
+
+    def _settle(self, command: _Command, status: int, detail: int) -> None:
         if status == messages.OK:
             return
         if command.on_refused is None:

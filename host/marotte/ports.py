@@ -35,6 +35,10 @@ READ_BYTES = 4096
 POLL_S = 0.001
 """Time between two looks at a port that cannot be waited on (on Windows, and some URLs)."""
 
+SAID_BYTES = 200
+"""What a port has said last is kept: one that is served may say why it closes."""
+
+_IN_USE = b"this emulated MCU is in use by"
 _MISSING = {errno.ENOENT, errno.ENODEV, errno.ENXIO}
 _BUSY = {errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK}
 _DENIED = {errno.EACCES, errno.EPERM}
@@ -89,6 +93,7 @@ class SerialCarrier:
         """Open `port` for this program alone."""
         self.port = port
         self._serial = _within(OPEN_TIMEOUT_S, port, lambda: _open(port, baud))
+        self._said = b""
         self._can_wait = os.name == "posix" and _has_descriptor(self._serial)
 
     def now_us(self) -> int:
@@ -110,15 +115,23 @@ class SerialCarrier:
         try:
             if self._can_wait:
                 select.select([self._serial.fileno()], [], [], wait_us / 1e6)
-                return bytes(self._serial.read(READ_BYTES))
+                return self._read()
             while True:
-                data = bytes(self._serial.read(READ_BYTES))
+                data = self._read()
                 left_s = deadline_s - time.monotonic()
                 if data or left_s <= 0:
                     return data
                 time.sleep(min(POLL_S, left_s))
         except (serial.SerialException, OSError, ValueError) as error:
+            if _IN_USE in self._said:
+                raise PortBusy(f"{self.port}: another program uses this port; close it first") from error
             raise PortVanished(_gone(self.port)) from error
+
+    def _read(self) -> bytes:
+        data = bytes(self._serial.read(READ_BYTES))
+        if data:
+            self._said = (self._said + data)[-SAID_BYTES:]
+        return data
 
     def close(self) -> None:
         """Close the port; calling it twice does no harm."""

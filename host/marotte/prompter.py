@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from marotte.score import Step
-from marotte.tables import tempo_q16, weight_q28
+from marotte.tables import gain4_q16, tempo_q16, weight_q28
 from shared import formats
 
 AHEAD_FRAMES = 30
@@ -24,6 +24,7 @@ class Directed(Protocol):
     def weight_targets(self, frame: int, targets_q28: dict[int, int]) -> None: ...
     def live_targets(self, frame: int, targets_q28: dict[int, int]) -> None: ...
     def tempo(self, frame: int, action: int, tempo_q16: int) -> None: ...
+    def gains(self, frame: int, gains4_q16: dict[int, int]) -> None: ...
 
 
 class Prompter:
@@ -62,6 +63,8 @@ class Prompter:
         frame = step.frame
         if step.weights:
             self._session.weight_targets(frame, {index: weight_q28(target) for index, target in step.weights.items()})
+        if step.gains is not None:
+            self._session.gains(frame, {band: gain4_q16(gain) for band, gain in enumerate(step.gains)})
         if step.lives:
             self._session.live_targets(frame, {index: weight_q28(target) for index, target in step.lives.items()})
         if step.master_tempo is not None:
@@ -71,4 +74,5 @@ class Prompter:
 
 
 def _targets(step: Step) -> int:
-    return len(step.weights) + len(step.lives) + len(step.tempos) + (step.master_tempo is not None)
+    has_master_tempo = step.master_tempo is not None
+    return len(step.weights) + len(step.gains or ()) + len(step.lives) + len(step.tempos) + has_master_tempo

@@ -13,11 +13,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from marotte.functions import Function
+from marotte.kalman import Kalman
 from marotte.limits import Limits, LimitsInUse, tightest
+from shared.formats import BANDS
 
 ABSOLUTE = "absolute"
 RELATIVE = "relative"
-BANDS = 7
+NEUTRAL_GAINS = (1.0,) * BANDS
+"""Gains that leave the motion as it is."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,8 @@ class Live:
     name: str
     rest: float = 0.5
     tau_s: tuple[float, float] = (0.1, 0.1)
-    predict: str = "hold"
+    kalman: Kalman | None = None
+    """How its movement is predicted; None if its target is expected to stay as it is."""
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from typing import Any
 
 from marotte.function_tables import FunctionReader
 from marotte.functions import Function, FunctionError
+from marotte.kalman import AGILITY_RANGE, FADE_RANGE_S, NOISE_RANGE, Kalman
 from marotte.limits import Limits, read_limits, read_range, whole_range
 from marotte.pools import Pools
 from marotte.positions import KeyPath
 from marotte.puppet import (
     ABSOLUTE,
-    BANDS,
     RELATIVE,
     Action,
     Character,
@@ -27,13 +27,26 @@ from marotte.puppet import (
     Mood,
     Puppet,
 )
-from marotte.tomlfile import Document, FileMistakes, Mistake, Table, check_number, did_you_mean, found, is_identifier
+from marotte.tomlfile import (
+    Document,
+    FileMistakes,
+    Mistake,
+    Table,
+    check_number,
+    did_you_mean,
+    found,
+    is_identifier,
+    key_text,
+)
 from shared import formats, program
 
 TEMPO_RANGE = (0.05, 8)
 MASTER_TEMPO_RANGE = (0.25, 4)
 WEIGHT_RANGE = (0, 4)
 GAIN_RANGE = (-4, 4)
+HOLD = "hold"
+KALMAN = "kalman"
+"""How the future of a live channel is predicted."""
 TAU_RANGE_S = (0.03, 10)
 WARP_RANGE_S = (0.05, 10)
 CYCLES_RANGE = (1, formats.CYCLES_MAX)
@@ -58,13 +71,13 @@ def load_puppet(path: str | Path) -> Puppet:
 def read_puppet(path: str | Path) -> tuple[Puppet, list[Mistake]]:
     """Return what could be read of a puppet, and every mistake in its file."""
     document = Document(path)
-    puppet = _Reader(document).puppet() if document.is_parsed else Puppet(Path(path).stem)
+    puppet = document.read_until_full(lambda: _Reader(document).puppet(), Puppet(Path(path).stem))
     return puppet, document.in_order()
 
 
 def weights(table: Table, actions: Iterable[str]) -> dict[str, float]:
     """Return the weight targets of a table whose keys are actions."""
-    known = list(actions)
+    known = dict.fromkeys(actions)
     targets = {}
     for name in table.names():
         if name not in known:
@@ -74,14 +87,10 @@ def weights(table: Table, actions: Iterable[str]) -> dict[str, float]:
     return targets
 
 
-def gains(table: Table) -> tuple[float, ...] | None:
+def read_gains(table: Table) -> tuple[float, ...] | None:
     """Return the seven gains of a table's `gains`, None if it has none."""
-    values = table.numbers("gains", BANDS, *GAIN_RANGE, what="the gains of the seven bands, highest first")
-    if values is None:
-        return None
-    if any(gain != 1 for gain in values):
-        table.not_yet("gains", "gains")
-    return tuple(values)
+    values = table.numbers("gains", formats.BANDS, *GAIN_RANGE, what="the gains of the seven bands, highest first")
+    return tuple(values) if values is not None else None
 
 
 class _Reader:
@@ -89,7 +98,7 @@ class _Reader:
         self.document = document
         self.root = document.root()
         self.functions = FunctionReader(document)
-        self.blinking: set[object] = set()
+        self.blinking: dict[str, KeyPath] = {}
         self.dofs: dict[str, Dof] = {}
         self.lives: dict[str, Live] = {}
         self.mapping_count = 0
@@ -138,23 +147,30 @@ class _Reader:
                 table.mistake(f"found {found(table.value('rest'))}, expected 0: a relative DOF rests at 0", "rest")
         limits = _limits(table, relative)
         signal = table.boolean("signal", default=None)
-        blinks = name in self.blinking
-        if signal and blinks:
-            table.mistake("found true, expected false: a DOF that blinks has no future to be known", "signal")
+        blink = self.blinking.get(name)
+        if signal and blink:
+            table.mistake(
+                f"found true, expected false: {key_text(blink)} makes it blink, and nobody knows when it will", "signal"
+            )
         character = self.character(table) if table.has("character") else None
         table.finish()
-        is_processed = signal if signal is not None else not (relative or blinks)
+        is_processed = signal if signal is not None else not (relative or blink)
         range_ = limits.range or whole_range(relative)
         return Dof(name, kind, rest, range_, is_processed, character, limits.speed, limits.accel)
 
-    def blinking_dofs(self) -> set[object]:
-        """Return the names of the DOFs that any mapping, in any action, makes blink."""
+    def blinking_dofs(self) -> dict[str, KeyPath]:
+        """Return the DOFs that any mapping, in any action, makes blink, and where the first such mapping stands."""
+        blinking: dict[str, KeyPath] = {}
         actions = self.root.value("action", {})
-        tables = [table for table in actions.values() if isinstance(table, dict)] if isinstance(actions, dict) else []
-        maps = [table["map"] for table in tables if isinstance(table.get("map"), list)]
-        rows = [row for rows in maps for row in rows if isinstance(row, list) and len(row) == 4]
-        parsed = [(dof, self.functions.parse(text)) for dof, _, _, text in rows if isinstance(dof, str)]
-        return {dof for dof, function in parsed if isinstance(function, Function) and function.blinks}
+        for name, action in actions.items() if isinstance(actions, dict) else ():
+            rows = action.get("map") if isinstance(action, dict) else None
+            for index, row in enumerate(rows if isinstance(rows, list) else ()):
+                if not isinstance(row, list) or len(row) != 4 or not isinstance(row[0], str):
+                    continue
+                function = self.functions.parse(row[3])
+                if isinstance(function, Function) and function.blinks:
+                    blinking.setdefault(row[0], ("action", name, "map", index))
+        return blinking
 
     def character(self, table: Table) -> Character:
         inner = table.table("character")
@@ -172,11 +188,17 @@ class _Reader:
             table.mistake("expected a name of letters, digits and _, as it stands in live(NAME)")
         rest = table.number("rest", 0, 1, Live.rest)
         tau_s = _tau(table, Live.tau_s)
-        predict = table.choice("predict", ("hold", "kalman"), Live.predict)
-        if predict == "kalman":
-            table.not_yet("predict", "kalman")
+        predict = table.choice("predict", (HOLD, KALMAN), HOLD)
+        kalman = Kalman(
+            table.number("noise", *NOISE_RANGE, default=Kalman.noise),
+            table.number("agility", *AGILITY_RANGE, default=Kalman.agility),
+            table.number("fade", *FADE_RANGE_S, default=Kalman.fade_s),
+        )
+        for key in ("noise", "agility", "fade"):
+            if table.has(key) and table.value("predict", HOLD) == HOLD:
+                table.mistake(f'only a channel with predict = "{KALMAN}" has {key}', key)
         table.finish()
-        return Live(name, rest, tau_s, predict)
+        return Live(name, rest, tau_s, kalman if predict == KALMAN else None)
 
     def action(self, table: Table, name: str) -> Action:
         if name == MASTER_NAME:
@@ -238,7 +260,7 @@ class _Reader:
 
     def mood(self, table: Table, name: str) -> Mood:
         tempo = table.number("tempo", *MASTER_TEMPO_RANGE, default=1.0) if table.has("tempo") else None
-        mood = Mood(name, gains(table), tempo)
+        mood = Mood(name, read_gains(table), tempo)
         table.finish()
         return mood
 

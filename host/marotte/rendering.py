@@ -36,6 +36,7 @@ PUMP_US = 20_000
 PATIENCE_US = 2_000_000
 """Virtual time without a new frame after which the MCU counts as stuck."""
 DIGITS = 9
+WEIGHT_Q12_ONE = 1 << 12
 
 Progress = Callable[[int, int], None]
 """Called with the number of frames done and of all frames."""
@@ -56,6 +57,8 @@ class Rendering:
     """Per DOF: the same after signal processing."""
     motor: dict[str, list[float]] = field(default_factory=dict)
     """Per DOF: the motor layer's trajectory at the frame's instant."""
+    weights: dict[str, list[float]] = field(default_factory=dict)
+    """Per action, in the file's order: its weight 0..4; empty if they were not asked for."""
     report: dict[str, Any] = field(default_factory=dict)
     """What the emulated MCU tells of the run: `kind`, `image`, `image_sha256`, `instructions` and more, by kind."""
     status: dict[str, int] = field(default_factory=dict)
@@ -98,13 +101,14 @@ def render(
     mcu: str | VirtualMcu = "unix",
     robot: Robot | None = None,
     progress: Progress | None = None,
+    weights: bool = False,
 ) -> Rendering:
     """Return what the puppet does in the first `seconds` of a score.
 
     `mcu` is `"unix"` (MicroPython on this machine, 64 bits), `"unix32"`, `"rp2040"` (the emulated chip), or an emulated MCU just
     switched on, which stays open, so that its pins can be looked at; what is connected to it is the caller's business then. With
-    a robot its outputs are armed and attached before frame 0. Raises MarotteError: RenderError, or what the link or the emulated
-    MCU has to say.
+    a robot its outputs are armed and attached before frame 0. With `weights` those of all actions are collected too. Raises
+    MarotteError: RenderError, or what the link or the emulated MCU has to say.
     """
     count = frame_count(seconds, puppet.frame_rate_hz)
     if count < 1:
@@ -115,7 +119,7 @@ def render(
         session = Session(VirtualCarrier(virtual))
         session.open()
         session.upload(build_tables(puppet, robot))
-        session.telemetry(TAPS, 1, 0)
+        session.telemetry(TAPS, 1, int(weights))
         prompter = Prompter(session, score.steps(puppet), session.welcome["queue_max"])
         prompter.reached(-1)
         if robot and robot.outputs:
@@ -123,6 +127,8 @@ def render(
             session.wait_attached()  # an output that is not attached stands still
         session.start()
         rendering = Rendering(puppet)
+        if weights:
+            rendering.weights.update((name, []) for name in puppet.actions)
         _collect(session, prompter, rendering, count, progress)
         rendering.status = session.status()
         _check_punctual(rendering.status)
@@ -161,11 +167,26 @@ def _collect(session: Session, prompter: Prompter, rendering: Rendering, count: 
                 column.append(value_of(value_q15, dof))
             done += 1
             waited_us = 0
+        _collect_weights(session, rendering, count)
         prompter.reached(done - 1)
         if progress:
             progress(done, count)
         if waited_us > PATIENCE_US:
             raise RenderError(f"the MCU has reported no frame after frame {done - 1} for {PATIENCE_US / 1e6:g} s")
+
+
+def _collect_weights(session: Session, rendering: Rendering, count: int) -> None:
+    """Keep the weights that have come, of the first `count` frames, if they are wanted."""
+    columns = list(rendering.weights.values())
+    while session.weights_seen:
+        frame, weights_q12 = session.weights_seen.popleft()
+        if columns and frame < count:
+            if frame != len(columns[0]):
+                raise RenderError(
+                    f"the MCU reported weights of frame {frame}, expected those of frame {len(columns[0])}"
+                )
+            for action, column in enumerate(columns):
+                column.append(weights_q12.get(action, 0) / WEIGHT_Q12_ONE)
 
 
 def _check_punctual(status: dict[str, int]) -> None:

@@ -12,8 +12,8 @@ from marotte.errors import MarotteError
 from marotte.files import Files, Watch
 from marotte.link import Carrier, LinkRefused
 from marotte.prompter import Prompter
-from marotte.puppet import Puppet
-from marotte.score import Score, resumed, state
+from marotte.puppet import NEUTRAL_GAINS, Puppet
+from marotte.score import Cue, Score, resumed, state
 from marotte.session import Session, killer
 from marotte.signals import interruptible, uninterruptible
 from marotte.tables import build_tables, value_of
@@ -208,6 +208,10 @@ class _Play:
         self._steps = files.score.steps(puppet)
         cues = [(cue.frame(puppet.frame_rate_hz), cue) for cue in sorted(files.score.cues, key=lambda cue: cue.at_s)]
         self._cues = [(frame, cue) for frame, cue in cues if frame > self.scene.frame]
+        self.scene.mood, self.scene.gains = "", NEUTRAL_GAINS
+        for frame, cue in cues:
+            if frame <= self.scene.frame:
+                self._show_mood(cue)
         self.scene.values = {}
         self.scene.weights = {}
         self.session.weights = (-1, {})
@@ -237,6 +241,7 @@ class _Play:
         before, self._status = self._status, status
         scene = self.scene
         scene.late_frames = status["late_frames"]
+        scene.clipped = status["clipped"]
         stalled = self._names(status["stalled"])
         for name in stalled - scene.stalled:
             self.view.note(f"{name} has stalled: it is without pulses until it is armed again")
@@ -262,7 +267,14 @@ class _Play:
         while self._cues and self._cues[0][0] <= self.scene.frame:
             _, cue = self._cues.pop(0)
             self.scene.cue = cue.summary()
+            self._show_mood(cue)
             self.view.cue(float(cue.at_s), self.scene.cue)
+
+    def _show_mood(self, cue: Cue) -> None:
+        if cue.mood is not None:
+            self.scene.mood = cue.mood
+            self.scene.gains = self.files.puppet.moods[cue.mood].gains or NEUTRAL_GAINS
+        self.scene.gains = cue.gains if cue.gains is not None else self.scene.gains
 
 
 def _driven(files: Files) -> set[tuple[str, str, Drive]]:

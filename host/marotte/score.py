@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 
-from marotte.puppet import Puppet
-from marotte.puppet_file import MASTER_NAME, MASTER_TEMPO_RANGE, TEMPO_RANGE, gains, weights
+from marotte.puppet import NEUTRAL_GAINS, Puppet
+from marotte.puppet_file import MASTER_NAME, MASTER_TEMPO_RANGE, TEMPO_RANGE, read_gains, weights
 from marotte.tomlfile import Document, FileMistakes, Mistake, Table, did_you_mean
 from shared.formats import FRAME_NOW
 
@@ -67,6 +67,8 @@ class Step:
     master_tempo: float | None
     tempos: Mapping[int, float] = field(default_factory=dict)
     """Tempos 0.05..8 by the action's index."""
+    gains: tuple[float, ...] | None = None
+    """Gains -4..4 of the bands, highest first."""
 
 
 @dataclass(frozen=True)
@@ -103,16 +105,18 @@ def state(steps: Sequence[Step], puppet: Puppet, frame: int) -> Step:
     lives = {index: live.rest for index, live in enumerate(puppet.lives.values())}
     tempos: dict[int, float] = {}
     master_tempo = 1.0
+    gains = NEUTRAL_GAINS
     for step in steps:
         if step.frame <= frame:
             weights.update(step.weights)
             lives.update(step.lives)
             tempos.update(step.tempos)
             master_tempo = step.master_tempo if step.master_tempo is not None else master_tempo
+            gains = step.gains if step.gains is not None else gains
     for index, action in enumerate(puppet.actions.values()):
         if action.cycles is not None:
             del weights[index]
-    return Step(frame, weights, lives, master_tempo, tempos)
+    return Step(frame, weights, lives, master_tempo, tempos, gains)
 
 
 def resumed(steps: Sequence[Step], puppet: Puppet, frame: int) -> list[Step]:
@@ -132,14 +136,17 @@ def load_score(path: str | Path, puppet: Puppet) -> Score:
 def read_score(path: str | Path, puppet: Puppet) -> tuple[Score, list[Mistake]]:
     """Return what could be read of a score, and every mistake in its file."""
     document = Document(path)
-    cues: list[Cue] = []
-    if document.is_parsed:
-        root = document.root()
-        cues = [_cue(table, puppet) for table in root.list_of_tables("cue")]
-        if not cues and document.is_parsed:
-            root.mistake("has no cue, expected at least one [[cue]]")
-        root.finish()
-    return Score(tuple(cues)), document.in_order()
+    score = document.read_until_full(lambda: _score(document, puppet), Score())
+    return score, document.in_order()
+
+
+def _score(document: Document, puppet: Puppet) -> Score:
+    root = document.root()
+    cues = [_cue(table, puppet) for table in root.list_of_tables("cue")]
+    if not cues and document.is_parsed:
+        root.mistake("has no cue, expected at least one [[cue]]")
+    root.finish()
+    return Score(tuple(cues))
 
 
 def _cue(table: Table, puppet: Puppet) -> Cue:
@@ -149,11 +156,11 @@ def _cue(table: Table, puppet: Puppet) -> Cue:
     behaviour = _name(table, "behaviour", puppet.behaviours)
     targets = weights(table.table("weights"), puppet.actions)
     mood = _name(table, "mood", puppet.moods)
-    cue_gains = gains(table)
+    gains = read_gains(table)
     lives = _lives(table.table("live"), puppet)
     tempos, master_tempo = _tempos(table.table("tempo"), puppet)
     table.finish()
-    return Cue(at_s, behaviour, targets, mood, cue_gains, lives, tempos, master_tempo)
+    return Cue(at_s, behaviour, targets, mood, gains, lives, tempos, master_tempo)
 
 
 def _name(table: Table, key: str, known: Mapping[str, object]) -> str | None:
@@ -195,14 +202,17 @@ def _step(puppet: Puppet, frame: int, cues: list[Cue], targets: dict[str, float]
     changed: dict[str, float] = {}
     lives: dict[str, float] = {}
     tempos: dict[str, float] = {}
-    master_tempo = None
+    master_tempo = gains = None
     for cue in cues:
         if cue.behaviour is not None:
             changed.update((name, 0.0) for name, target in (targets | changed).items() if target > 0)
             changed.update(puppet.behaviours[cue.behaviour])
         changed.update(cue.weights)
-        if cue.mood is not None and puppet.moods[cue.mood].tempo is not None:
-            master_tempo = puppet.moods[cue.mood].tempo
+        if cue.mood is not None:
+            mood = puppet.moods[cue.mood]
+            gains = mood.gains or NEUTRAL_GAINS
+            master_tempo = mood.tempo if mood.tempo is not None else master_tempo
+        gains = cue.gains if cue.gains is not None else gains
         lives.update(cue.lives)
         tempos.update(cue.tempos)
         master_tempo = cue.master_tempo if cue.master_tempo is not None else master_tempo
@@ -213,4 +223,5 @@ def _step(puppet: Puppet, frame: int, cues: list[Cue], targets: dict[str, float]
         {puppet.live_index(name): target for name, target in lives.items()},
         master_tempo,
         {puppet.action_index(name): tempo for name, tempo in tempos.items()},
+        gains,
     )

@@ -13,7 +13,7 @@ session.pump(20_000)        # often: at least every 200 ms, or the MCU finds the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 from marotte.keeping import kept
@@ -27,16 +27,28 @@ from shared import codec, formats, messages
 
 OPEN_TIMEOUT_S = 1.5
 UPLOAD_TIMEOUT_S = 5.0
+"""For the next of a puppet's tables that is acknowledged."""
 SAVE_TIMEOUT_S = 10.0
 """Erasing and writing flash keeps the MCU from answering for a while."""
 ATTACH_TIMEOUT_S = 2.0
 """Beyond the intervals at which outputs are attached."""
 LOOK_US = 20_000
 """How often the MCU is asked while its outputs are being attached."""
-PING_US = 100_000
-GREETING_US = 150_000
+WEIGHTS_KEPT = 64
+"""Messages with weights that wait for whoever wants them all."""
+PING_US = 160_000
+PINGS = 3
+"""At least so many fit into a robot's `link_timeout`."""
+STREAM_US = 160_000
+"""How often targets that change all the time are sent: six of them, with their answers, take less than 3 % of a UART at 115200
+baud. Weights follow them through two filters, which at the default `tau` let little pass that is quicker.
+"""
+GREETING_US = 50_000
 STEP_US = 2_000
 """Longest wait for one look at the carrier while something is expected."""
+
+TAPS_KEPT = 1 << 16
+"""Frames whose taps wait to be taken; of more than that, the oldest are dropped."""
 
 DICTIONARY = codec.crc32(messages.canonical_text().encode())
 
@@ -66,20 +78,24 @@ class Session:
     """One host and one MCU. All methods raise LinkError, or what the carrier raises, when the MCU or the port is gone.
 
     `welcome` holds the fields of the MCU's greeting. `taps` collects `(frame, taps, values_q15)` as telemetry brings
-    them: the values of all DOFs, base, signal and motor one after the other as far as `taps` names them. `weights` is
-    `(frame, {action: weight_q12})` of the last weights message.
+    them, the newest TAPS_KEPT: the values of all DOFs, base, signal and motor one after the other as far as `taps` names them.
+    `weights` is `(frame, {action: weight_q12})` of the last weights message, `weights_seen` has the last WEIGHTS_KEPT of them.
     """
 
     def __init__(self, carrier: Carrier):
         self.carrier = carrier
         self.link = Link(carrier, self._on_message)
         self.welcome: dict[str, int] = {}
-        self.taps: deque[tuple[int, int, list[int]]] = deque()
+        self.taps: deque[tuple[int, int, list[int]]] = deque(maxlen=TAPS_KEPT)
         self.weights: tuple[int, dict[int, int]] = (-1, {})
+        self.weights_seen: deque[tuple[int, dict[int, int]]] = deque(maxlen=WEIGHTS_KEPT)
         self._tables: Tables | None = None
         self._status: dict[str, int] = {}
         self._motor_status: dict[str, int] = {}
         self._posted_us = carrier.now_us()
+        self._ping_us = PING_US
+        self._stream: dict[int, int] = {}  # targets that wait for their turn
+        self._streamed_us = self._posted_us - STREAM_US
 
     def open(self, timeout_s: float = OPEN_TIMEOUT_S) -> None:
         """Greet the MCU, at first or again. Raises LinkSilent if nothing answers in time, LinkForeign if something else does."""
@@ -92,6 +108,7 @@ class Session:
                 raise self._no_welcome(timeout_s)
             carrier.write(b"\0")  # whatever was half sent before ends here
             self.link.forget()
+            self._stream = {}
             hello = {"protocol": messages.PROTOCOL, "dictionary": DICTIONARY}
             self._post("hello", hello, on_refused=lambda status, _: refused.append(status))
             again_us = min(carrier.now_us() + GREETING_US, end_us)
@@ -116,14 +133,12 @@ class Session:
         refused: list[LinkRefused] = []
         for name, fields, items in parts:
             self._post(name, fields, items, partial(_note_refusal, refused, name))
-        end_us = self.carrier.now_us() + round(UPLOAD_TIMEOUT_S * 1e6)
-        while self.link.pending:
-            self._step(end_us, "the puppet's tables were not acknowledged")
+        for pending in self._flushing(UPLOAD_TIMEOUT_S, "the puppet's tables were not acknowledged"):
             if progress:
-                progress(max(0, len(parts) - self.link.pending), len(parts))
+                progress(max(0, len(parts) - pending), len(parts))
         if refused:
             raise refused[0]
-        self._tables = tables
+        self._plays(tables, parts[0])
 
     def exchange(self, tables: Tables, playing: Puppet) -> None:
         """Replace the tables of a puppet that moves, between two frames.
@@ -141,7 +156,12 @@ class Session:
         end_us = self.carrier.now_us() + round(UPLOAD_TIMEOUT_S * 1e6)
         while self._post_all([begin]):  # refused as long as the exchange is being prepared
             self._step(end_us, "the exchange of tables was not carried out")
+        self._plays(tables, begin)
+
+    def _plays(self, tables: Tables, begin: Command) -> None:
+        """Note which tables the MCU plays now, and how soon it finds the link silent, which their first message says."""
         self._tables = tables
+        self._ping_us = min(PING_US, begin[1]["link_timeout_ms"] * 1000 // PINGS)
 
     def _post_all(self, group: list[Command], timeout_s: float = UPLOAD_TIMEOUT_S) -> list[LinkRefused]:
         """Send commands, wait until all are answered; return what the MCU refused."""
@@ -249,22 +269,46 @@ class Session:
     def weight_targets(
         self, frame: int, targets_q28: dict[int, int], on_refused: Callable[[int, int], None] | None = None
     ) -> None:
-        """Send weight targets by index of action, to act in `frame` or at once (FRAME_NOW)."""
+        """Send weight targets by index of action, to act in `frame` or at once (FRAME_NOW).
+
+        What is to act at once takes the place of older targets of that kind for the same actions that have not left yet.
+        """
         items = [{"action": action, "target_q28": target} for action, target in targets_q28.items()]
-        self._post_items("weight_targets", frame, items, on_refused)
+        self._post_items("weight_targets", frame, items, on_refused, "action")
+
+    def stream_weights(self, targets_q28: dict[int, int]) -> None:
+        """Send weight targets that change all the time, as those of sliders do, to act at once.
+
+        They go out if none have for STREAM_US, else then, the newest of each action; the last ones always.
+        """
+        self._stream.update(targets_q28)
+        self._send_stream()
+
+    def _send_stream(self, at_once: bool = False) -> None:
+        if self._stream and (at_once or self.carrier.now_us() - self._streamed_us >= STREAM_US):
+            self._streamed_us = self.carrier.now_us()
+            targets_q28, self._stream = self._stream, {}
+            self.weight_targets(formats.FRAME_NOW, targets_q28)
 
     def live_targets(
         self, frame: int, targets_q28: dict[int, int], on_refused: Callable[[int, int], None] | None = None
     ) -> None:
-        """Send targets of live channels by index, to act in `frame` or at once (FRAME_NOW)."""
+        """Send targets of live channels by index, to act in `frame` or at once (FRAME_NOW), like weight targets."""
         items = [{"live": live, "target_q28": target} for live, target in targets_q28.items()]
-        self._post_items("live_targets", frame, items, on_refused)
+        self._post_items("live_targets", frame, items, on_refused, "live")
 
     def tempo(
         self, frame: int, action: int, tempo_q16: int, on_refused: Callable[[int, int], None] | None = None
     ) -> None:
         """Set the tempo of an action by its index, or of all (MASTER), from `frame` on or at once (FRAME_NOW)."""
         self._post_items("tempo", frame, [{"action": action, "tempo_q16": tempo_q16}], on_refused)
+
+    def gains(
+        self, frame: int, gains4_q16: dict[int, int], on_refused: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Send gains of bands by index, the highest 0, from `frame` on or at once (FRAME_NOW)."""
+        items = [{"band": band, "gain4_q16": gain} for band, gain in gains4_q16.items()]
+        self._post_items("gains", frame, items, on_refused)
 
     def telemetry(self, taps: int, taps_every: int, weights_every: int) -> None:
         """Ask for taps (bits of TAP_BASE, TAP_SIGNAL, TAP_MOTOR) and weights, every so many frames; 0 is never.
@@ -297,19 +341,29 @@ class Session:
 
     def pump(self, wait_us: int) -> None:
         """Let at most `wait_us` pass, take what has come, keep the link alive."""
-        if self.carrier.now_us() - self._posted_us >= PING_US:
+        self._send_stream()
+        if self.carrier.now_us() - self._posted_us >= self._ping_us:
             self._post("ping")
         self.link.pump(wait_us)
 
     def flush(self, timeout_s: float = 1.0) -> None:
-        """Wait until every command is acknowledged."""
-        end_us = self.carrier.now_us() + round(timeout_s * 1e6)
-        while self.link.pending:
-            self._step(end_us, "commands were not acknowledged")
+        """Wait until every command is acknowledged, `timeout_s` at most for the next one that is."""
+        for _ in self._flushing(timeout_s, "commands were not acknowledged"):
+            pass
 
     def close(self) -> None:
         """Close the port. It does not stop the puppet: `stop` and `kill` do."""
         self.carrier.close()
+
+    def _flushing(self, timeout_s: float, complaint: str) -> Iterator[int]:
+        """Let moments pass until every command is acknowledged; yield how many are not."""
+        self._send_stream(at_once=True)
+        before = end_us = 0
+        while pending := self.link.pending:
+            if pending != before:
+                before, end_us = pending, self.carrier.now_us() + round(timeout_s * 1e6)
+            self._step(end_us, complaint)
+            yield self.link.pending
 
     def _step(self, end_us: int, complaint: str) -> None:
         if self.carrier.now_us() >= end_us:
@@ -327,8 +381,20 @@ class Session:
         self.link.post(name, fields, items, on_refused)
 
     def _post_items(
-        self, name: str, frame: int, items: list[dict[str, int]], on_refused: Callable[[int, int], None] | None
+        self,
+        name: str,
+        frame: int,
+        items: list[dict[str, int]],
+        on_refused: Callable[[int, int], None] | None,
+        index: str = "",
     ) -> None:
+        if index and frame == formats.FRAME_NOW:
+            new = {item[index] for item in items}
+
+            def is_superseded(message: Message) -> bool:
+                return message.fields["frame"] == frame and new.issuperset(item[index] for item in message.items)
+
+            self.link.withdraw(name, is_superseded)
         room = items_per_message(name)
         for start in range(0, len(items), room):
             self._post(name, {"frame": frame}, items[start : start + room], on_refused)
@@ -342,6 +408,7 @@ class Session:
         elif message.name == "weights":
             weights = {item["action"]: item["weight_q12"] for item in message.items}
             self.weights = (message.fields["frame"], weights)
+            self.weights_seen.append(self.weights)
         elif message.name == "status":
             self._status = message.fields
         elif message.name == "motor_status":

@@ -18,11 +18,12 @@ from typing import TypeAlias
 
 from marotte.character import response
 from marotte.fixed import fixed
+from marotte.kalman import kalman_fields
 from marotte.limits import LimitsInUse
 from marotte.link import PAYLOAD_SENT_MAX
 from marotte.outputs import Feedback, Output
 from marotte.pools import Pools
-from marotte.puppet import Action, Dof, MappingEntry, Puppet
+from marotte.puppet import Action, Dof, Live, MappingEntry, Puppet
 from marotte.wiring import Robot
 from shared import formats, messages
 
@@ -73,8 +74,7 @@ class Tables:
         for start in range(0, len(mappings), step):
             yield "mappings", {"first_mapping": start}, mappings[start : start + step]
         for index, live in enumerate(puppet.lives.values()):
-            rise, fall = (alpha_q26(tau_s, puppet.frame_rate_hz) for tau_s in live.tau_s)
-            yield "live", {"live": index, "rest_q28": weight_q28(live.rest), "rise_q26": rise, "fall_q26": fall}, []
+            yield "live", self._live(index, live), []
         for index, samples_q15 in enumerate(pools.curves):
             yield from _in_parts("curve", {"curve": index, "samples": len(samples_q15)}, "value_q15", samples_q15)
         for index, words in enumerate(pools.programs):
@@ -132,6 +132,7 @@ class Tables:
             "kind": formats.KIND_RELATIVE if dof.is_relative else formats.KIND_ABSOLUTE,
             "rest_q15": value_q15(dof.rest, dof),
             **limit_fields(self.limits(dof), dof, self.tick_s),
+            "signal": int(dof.signal),
         }
 
     def _outputs(self) -> Iterator[Message]:
@@ -174,6 +175,20 @@ class Tables:
             "entry": formats.ENTRY_START if action.entry == "start" else formats.ENTRY_SYNC,
             "warp_q26": alpha_q26(action.warp_s, self.puppet.frame_rate_hz),
             "cycles": action.cycles or 0,
+        }
+
+    def _live(self, index: int, live: Live) -> dict[str, int]:
+        frame_rate_hz = self.puppet.frame_rate_hz
+        rise, fall = (alpha_q26(tau_s, frame_rate_hz) for tau_s in live.tau_s)
+        prediction = {"predict": formats.PREDICT_HOLD, "process_q16": 0, "noise_q16": 0, "fade_q15": 0}
+        if live.kalman:
+            prediction = {"predict": formats.PREDICT_KALMAN, **kalman_fields(live.kalman, frame_rate_hz)}
+        return {
+            "live": index,
+            "rest_q28": weight_q28(live.rest),
+            "rise_q26": rise,
+            "fall_q26": fall,
+            **prediction,
         }
 
     def _mapping(self, entry: MappingEntry, pools: Pools) -> dict[str, int]:
@@ -265,6 +280,11 @@ def weight_q28(weight: float) -> int:
 def tempo_q16(tempo: float) -> int:
     """Return a tempo, rounded to 1/65536."""
     return fixed(tempo, formats.TEMPO_BITS)
+
+
+def gain4_q16(gain: float) -> int:
+    """Return a band's gain -4..4 as it travels: with 4 added, so that it is never negative."""
+    return fixed(gain + 4, formats.GAIN_BITS)
 
 
 def alpha_q26(tau_s: float, frame_rate_hz: int) -> int:

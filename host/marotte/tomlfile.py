@@ -12,15 +12,16 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
+from decimal import Context, Decimal
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
 from marotte.errors import MarotteError
 from marotte.positions import KeyPath, line_numbers
-from marotte.supported import NOT_YET
+from marotte.textfile import UnreadableError, read_text
 
 T = TypeVar("T")
 
@@ -28,6 +29,16 @@ _TOML_PLACE = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _NAME = re.compile(r"[\w-]+")
 _FOUND_MAX = 60
+_FOUND_DEPTH_MAX = 3
+MISTAKES_MAX = 100
+"""Mistakes of one file that are told; with more, something else is wrong with it."""
+
+_DOTS_MAX = 600
+_NEAR_MAX = 200
+"""Longest list of names in which a similar one is looked for, and longest such name."""
+
+_DECIMALS = Context(prec=60, Emin=-400, Emax=400, traps=[])
+"""Numbers with a point keep 60 digits and become 0 below 10^-400: as a fraction, 1e-999999999 would fill the memory."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +65,10 @@ class FileMistakes(MarotteError):
         self.mistakes = tuple(mistakes)
 
 
+class TooManyMistakes(Exception):
+    """A file has so many mistakes that it is not looked at any further."""
+
+
 def key_text(path: KeyPath) -> str:
     """Return a key path as text: `("cue", 3, "at")` is `cue[3].at`."""
     text = ""
@@ -61,30 +76,38 @@ def key_text(path: KeyPath) -> str:
         if isinstance(key, int):
             text += f"[{key}]"
         else:
-            text += ("." if text else "") + (key if _NAME.fullmatch(key) else repr(key))
+            text += ("." if text else "") + _short(key if _NAME.fullmatch(key) else repr(key))
     return text
 
 
-def found(value: object) -> str:
-    """Return a value as a mistake quotes it: TOML's spelling, not too long."""
+def found(value: object, depth: int = 0) -> str:
+    """Return a value as a mistake quotes it: TOML's spelling, not too long. `depth` is how many arrays it is in."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, Mapping):
         return "a table"
     if isinstance(value, str):
-        text = '"' + value.encode("unicode_escape").decode("ascii") + '"'
+        text = '"' + value[:_FOUND_MAX].encode("unicode_escape").decode("ascii") + '"'
+    elif isinstance(value, list) and depth == _FOUND_DEPTH_MAX:
+        text = "[...]"
     elif isinstance(value, list):
-        text = "[" + ", ".join(found(item) for item in value[:8]) + (", ...]" if len(value) > 8 else "]")
+        text = "[" + ", ".join(found(item, depth + 1) for item in value[:8]) + (", ...]" if len(value) > 8 else "]")
     elif isinstance(value, int) and abs(value) >= 10**20:
         text = "an enormous number"
     else:
         text = str(value)
+    return _short(text)
+
+
+def _short(text: str) -> str:
     return text if len(text) <= _FOUND_MAX else text[: _FOUND_MAX - 4] + " ..."
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return `; did you mean "X"?` if a known name is near, else an empty text."""
-    by_case = {candidate.lower(): candidate for candidate in known}
+    by_case = {candidate.lower(): candidate for candidate in islice(known, _NEAR_MAX) if len(candidate) <= _NEAR_MAX}
+    if len(name) > _NEAR_MAX:
+        return ""
     near = difflib.get_close_matches(name.lower(), by_case, n=1)
     return f'; did you mean "{by_case[near[0]]}"?' if near else ""
 
@@ -123,32 +146,46 @@ class Document:
         return frozenset(self._values)
 
     def mistake(self, path: KeyPath, text: str) -> None:
-        """Note a mistake at a key path; one that is not in the file is placed at the table that it belongs to."""
+        """Note a mistake at a key path; one that is not in the file is placed at the table that it belongs to.
+
+        Raises TooManyMistakes with the last one that is told; `read_until_full` takes care of that.
+        """
         prefixes = (path[:length] for length in range(len(path), 0, -1))
         line = next((self._lines[prefix] for prefix in prefixes if prefix in self._lines), None)
         self.mistakes.append(Mistake(str(self.path), line, key_text(path), text))
-
-    def not_yet(self, path: KeyPath, feature: str) -> None:
-        """Note a mistake if this version does not perform `feature`, a key of `supported.NOT_YET`."""
-        if feature in NOT_YET:
-            self.mistake(path, f"{NOT_YET[feature]} is not supported by this version")
+        if len(self.mistakes) >= MISTAKES_MAX:
+            raise TooManyMistakes
 
     def in_order(self) -> list[Mistake]:
         """Return the mistakes in the order of their lines, those without one last."""
-        return sorted(self.mistakes, key=lambda mistake: (mistake.line is None, mistake.line or 0))
+        mistakes = sorted(self.mistakes, key=lambda mistake: (mistake.line is None, mistake.line or 0))
+        if len(mistakes) >= MISTAKES_MAX:
+            mistakes.append(Mistake(str(self.path), None, "", "has more mistakes, which were not looked for"))
+        return mistakes
+
+    def read_until_full(self, read: Callable[[], T], rest: T) -> T:
+        """Return what `read` makes of the document; `rest` if it cannot be parsed or has too many mistakes."""
+        if not self.is_parsed:
+            return rest
+        try:
+            return read()
+        except TooManyMistakes:
+            return rest
 
     def _text(self) -> str | None:
         try:
-            return self.path.read_bytes().decode("utf-8")
-        except UnicodeDecodeError as error:
-            self.mistake((), f"found the byte {error.object[error.start]:#04x}, expected a text file in UTF-8")
-        except OSError as error:
-            self.mistake((), f"cannot be read: {(error.strerror or str(error)).lower()}")
-        except ValueError:  # a null character in the name
-            self.mistake((), "cannot be read: no such file")
+            return read_text(self.path)
+        except UnreadableError as error:
+            self.mistake((), str(error))
         return None
 
     def _parse(self, text: str) -> None:
+        for number, line in enumerate(text.split("\n"), start=1):
+            if line.count(".") > _DOTS_MAX and not line.lstrip().startswith("#"):
+                # `tomllib` takes a time that grows with the square of the parts of a dotted key.
+                what = f"has {line.count('.')} points, expected at most {_DOTS_MAX} in a line"
+                self.mistakes.append(Mistake(str(self.path), number, "", what))
+                return
         try:
             self._values = tomllib.loads(text, parse_float=_decimal)
         except tomllib.TOMLDecodeError as error:
@@ -171,9 +208,12 @@ class Document:
 
 
 def _decimal(text: str) -> Decimal:
+    rounded = _DECIMALS.create_decimal(text)
+    if rounded.is_finite():
+        return rounded
     try:
-        return Decimal(text)
-    except ArithmeticError:  # an exponent beyond all bounds
+        return Decimal(text)  # which no key takes: it is only told
+    except ArithmeticError:
         return Decimal("inf")
 
 
@@ -210,10 +250,6 @@ class Table:
     def mistake(self, text: str, *keys: str | int) -> None:
         """Note a mistake of the table itself, or of what `keys` lead to in it."""
         self.document.mistake((*self.path, *keys), text)
-
-    def not_yet(self, key: str, feature: str) -> None:
-        """Note a mistake at a key if this version does not perform the feature."""
-        self.document.not_yet((*self.path, key), feature)
 
     def number(self, key: str, low: float, high: float, default: float) -> float:
         """Return a number in `low`..`high`."""

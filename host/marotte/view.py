@@ -15,7 +15,7 @@ from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
 
-from marotte.puppet import Dof, Puppet
+from marotte.puppet import NEUTRAL_GAINS, Dof, Puppet
 from marotte.wiring import Robot
 
 BAR_WIDTH = 30
@@ -44,7 +44,13 @@ class Scene:
     """Per action, 0..4."""
     cue: str = ""
     """The last cue, as its line says it."""
+    mood: str = ""
+    """The last mood that a cue has set."""
+    gains: tuple[float, ...] = NEUTRAL_GAINS
+    """What becomes of the bands, highest first."""
     late_frames: int = 0
+    clipped: int = 0
+    """Values that signal processing has clipped at the ends of their range."""
     stalled: frozenset[str] = frozenset()
     """DOFs that do not move although they should, and have lost their pulses for it."""
     released: frozenset[str] = frozenset()
@@ -100,8 +106,8 @@ class View:
 
     def picture(self, scene: Scene) -> RenderableType:
         """Return the whole picture of a scene."""
-        parts: list[RenderableType] = [self._headline(scene), Rule(style="dim"), self._dofs(scene), Rule(style="dim")]
-        parts += [self._weights(scene), Rule(style="dim"), self._footer(scene)]
+        parts: list[RenderableType] = [self._headline(scene), Rule(style="dim"), self._dofs(scene)]
+        parts += [_mood(scene), self._weights(scene), Rule(style="dim"), self._footer(scene)]
         return Constrain(Group(*parts), self.console.width - ECHO_WIDTH)
 
     def _headline(self, scene: Scene) -> RenderableType:
@@ -169,7 +175,8 @@ class View:
         alert = "no word from the MCU" if scene.is_silent else scene.alert
         left = Text(alert, style="yellow") if alert else Text(scene.cue, style="italic")
         late = f"{scene.late_frames} late frames  " if scene.late_frames else ""
-        line.add_row(left, Text.assemble((late, "yellow"), ("Ctrl-C stops", "dim")))
+        clipped = f"{scene.clipped} values clipped  " if scene.clipped else ""
+        line.add_row(left, Text.assemble((late + clipped, "yellow"), ("Ctrl-C stops", "dim")))
         return line
 
 
@@ -187,6 +194,13 @@ def centred_text(value: float, width: int) -> str:
     bar = _FULL * length
     left, right = (bar.rjust(half), " " * half) if value < 0 else (" " * half, bar.ljust(half))
     return left.replace(" ", _TRACK) + right.replace(" ", _TRACK)
+
+
+def _mood(scene: Scene) -> RenderableType:
+    """Return a rule with the mood and the gains, as far as there is something to say."""
+    gains = " ".join(f"{gain:g}" for gain in scene.gains) if scene.gains != NEUTRAL_GAINS else ""
+    parts = [f"mood {scene.mood}" if scene.mood else "", f"gains {gains}" if gains else ""]
+    return Rule(Text(", ".join(part for part in parts if part)), style="dim", align="left")
 
 
 def _dof_bar(value: float, dof: Dof) -> Text:

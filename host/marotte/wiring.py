@@ -88,8 +88,11 @@ def load_robot(path: str | Path, puppet: Puppet | None = None) -> Robot:
 def read_robot(path: str | Path, puppet: Puppet | None = None) -> tuple[Robot, list[Mistake]]:
     """Return what could be read of a robot, and every mistake in its file."""
     document = Document(path)
-    if not document.is_parsed:
-        return Robot(), document.mistakes
+    robot = document.read_until_full(lambda: _robot(document, puppet), Robot())
+    return robot, document.in_order()
+
+
+def _robot(document: Document, puppet: Puppet | None) -> Robot:
     root = document.root()
     name = root.text("name", document.path.stem)
     mcu = root.choice("mcu", ("rp2040",), "rp2040")
@@ -107,7 +110,7 @@ def read_robot(path: str | Path, puppet: Puppet | None = None) -> tuple[Robot, l
     robot = Robot(name, mcu, link_timeout_s, known, rate_hz, attach_interval_s, autostart, kill, chips)
     for dof, output in known.items():
         _check_together(tables[dof], output, robot, plan)
-    return robot, document.in_order()
+    return robot
 
 
 def _kill(table: Table, plan: PinPlan) -> Kill | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import marotte
+from marotte import cli
 from marotte.errors import MarotteError
 from marotte.mcu.unix import UnixMcu
 from marotte.pulses import pulses
@@ -180,6 +181,50 @@ def test_rendering_on_an_mcu_of_the_callers_leaves_its_pins_to_look_at(tmp_path)
         assert {pulse.width_ns for pulse in pulses(mcu.edges(4))} == {1_750_000}
         assert {pulse.width_ns for pulse in pulses(mcu.edges(5))} == {1_510_000}
         assert mcu.edges(6) == []
+
+
+def test_rendering_has_the_weights_of_every_frame_if_they_are_asked_for(tmp_path):
+    puppet = """
+    frame_rate = 60
+    [dof.A]
+    [action.IDLE]
+    map = [["A", 0, 1, "rsin"]]
+    [action.UP]
+    tau = 0.03
+    map = [["A", 0, 1, "rsin"]]
+    """
+    score = "[[cue]]\nat=0.5\nweights={UP=4}\n[[cue]]\nat=1.5\nweights={UP=0}\n"
+    loaded = files(tmp_path, puppet, score)[:2]
+    rendering = marotte.render(*loaded, 3, weights=True)
+    assert rendering.weights["IDLE"] == [0.0] * 180
+    up = rendering.weights["UP"]
+    assert up[:30] == [0.0] * 30 and 0 < up[30] < 4
+    assert up[70:90] == [4.0] * 20
+    assert 0 < up[90] < 4 and up[135:] == [0.0] * 45
+    without = marotte.render(*loaded, 3)
+    assert (without.weights, without.motor) == ({}, rendering.motor)
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_rendering_is_drawn_by_the_command_line(tmp_path, capsys, suffix):
+    arguments = [str(PUPPETS / "pet.toml"), "--score", str(PUPPETS / "pet-score.toml"), "--seconds", "1"]
+    robot = ["--robot", str(PUPPETS / "pet-robot.toml")]
+    out = tmp_path / f"pet.{suffix}"
+    assert cli.main(["plot", *arguments, *robot, "--dof", "NECK", "EYEBROW", "--out", str(out)]) == 0
+    assert capsys.readouterr().out == f"{out}: 30 frames\n"
+    begin = {"png": b"\x89PNG\r\n\x1a\n", "svg": b"<?xml"}[suffix]
+    assert out.read_bytes().startswith(begin) and out.stat().st_size > 10_000
+
+
+def test_rendering_sends_gains_that_leave_the_base_as_it_is(tmp_path):
+    """Whatever becomes of the signal: a score's gains arrive, and change nothing before signal processing."""
+    puppet = "[dof.A]\n[action.SWAY]\nmap=[['A',0.4,0.6,'noise1']]\n[mood.NERVOUS]\ngains=[4,-4,2,0,1,1,1]\n"
+    calm = "[[cue]]\nat=0\nweights={SWAY=1}\n"
+    nervous = f"{calm}mood='NERVOUS'\n[[cue]]\nat=0.5\ngains=[1,1,1,1,1,1,1]\n"
+    one, two = (marotte.render(*files(tmp_path, puppet, score)[:2], 1) for score in (calm, nervous))
+    assert one.base == two.base
+    assert one.signal["A"] == pytest.approx(one.base["A"], abs=1 / 32768), "all gains are 1"
+    assert two.status["late_targets"] == 0 and one.status["packets"] < two.status["packets"]
 
 
 def test_rendering_that_holds_no_frame_is_refused(pet, pet_score):

@@ -128,7 +128,7 @@ def test_run_on_an_mcu_that_falls_silent_ends_with_an_error(pet, mcu):
         if scene.frame > 10:
             carrier.write = lambda data: None
 
-    with pytest.raises(LinkSilent, match="has not answered"):
+    with pytest.raises(LinkSilent, match="can be heard, but has answered no command"):
         perform(puppet, score, carrier, Watch(puppet, unplug), robot=robot, arm=True)
 
 

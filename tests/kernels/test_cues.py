@@ -21,6 +21,7 @@ LIMITS = {
     MODULE.WEIGHT: (0, formats.ACTIONS_MAX, 0, formats.WEIGHT_MAX),
     MODULE.LIVE: (0, formats.LIVES_MAX, 0, formats.WEIGHT_ONE),
     MODULE.TEMPO: (formats.MASTER, 1, formats.MASTER_TEMPO_MIN_Q16, formats.MASTER_TEMPO_MAX_Q16),
+    MODULE.GAIN: (0, formats.BANDS, 0, formats.GAIN4_MAX),
 }
 
 
@@ -109,46 +110,65 @@ queued = (
         st.integers(0, 3),
         integers(formats.TEMPO_MIN_Q16, formats.TEMPO_MAX_Q16),
     )
+    | st.builds(
+        Target,
+        integers(0, LATEST_FRAME, 99, 100, 101),
+        st.sampled_from([MODULE.GAIN, MODULE.GAIN | NOW]),
+        st.integers(0, formats.BANDS - 1),
+        integers(0, formats.GAIN4_MAX),
+    )
 )
 
 
 @given(
-    st.lists(queued, max_size=ROOM), integers(0, LATEST_FRAME, 100), st.tuples(st.integers(0, 10), st.integers(0, 1))
+    st.lists(queued, max_size=ROOM),
+    integers(0, LATEST_FRAME, 100),
+    st.tuples(st.integers(0, 10), st.integers(0, 1)),
+    st.integers(0, 1),
 )
-def test_targets_act_in_their_frame_in_order_and_the_rest_waits(targets, frame, before):
+def test_targets_act_in_their_frame_in_order_and_the_rest_waits(targets, frame, before, consume):
     queue = Queue(targets)
-    weights, lives, master, tempos, counts = (
-        words([-1] * 4),
-        words([-2] * 4),
-        words([-3]),
-        words([-4] * 4),
-        words(before),
-    )
-    count = MODULE._apply(frame, len(targets), *queue.arrays, weights, lives, master, tempos, counts)
+    arrays = words([-1] * 4), words([-2] * 4), words([-3]), words([-4] * 4), words([-5] * 7)
+    counts = words([*before, 0, 0])
+    count = MODULE._apply(frame, consume, len(targets), *queue.arrays, *arrays, counts)
 
     due = [target for target in targets if target.frame <= frame]
-    assert queue.targets(count) == [target for target in targets if target.frame > frame]
-    expected = [-1] * 4, [-2] * 4, [-4] * 4, [-3]
-    changes = 0
+    left = [target for target in targets if target.frame > frame] if consume else targets
+    assert queue.targets(count) == left, "all of them if they are to act again"
+    expected = [-1] * 4, [-2] * 4, [-3], [-4] * 4, [-5] * 7
+    changes = news = streamed = 0
     for target in due:
         kind = target.kind & ~NOW
         if kind == MODULE.TEMPO and target.index == formats.MASTER:
-            expected[3][0] = target.value
+            expected[2][0] = target.value
         else:
-            expected[[MODULE.WEIGHT, MODULE.LIVE, MODULE.TEMPO].index(kind)][target.index] = target.value
+            expected[{MODULE.WEIGHT: 0, MODULE.LIVE: 1, MODULE.TEMPO: 3, MODULE.GAIN: 4}[kind]][target.index] = (
+                target.value
+            )
             changes += kind == MODULE.TEMPO
-    assert (list(weights), list(lives), list(tempos), list(master)) == expected
-    late = sum(target.frame < frame and not target.kind & NOW for target in due)
-    assert list(counts) == [before[0] + late, before[1] + changes]
+        news += kind != MODULE.GAIN
+        streamed |= 1 << target.index if kind == MODULE.LIVE else 0
+    assert tuple(map(list, arrays)) == expected
+    late = sum(target.frame < frame and not target.kind & NOW for target in due) if consume else 0
+    assert MODULE._is_news(frame, len(targets), *Queue(targets).arrays[:2]) == (news > 0)
+    assert list(counts) == [before[0] + late, before[1] + changes, news, streamed]
+
+
+def test_count_of_late_targets_stays_where_it_needs_no_memory():
+    counts = words([(1 << 30) - 2, 0, 0, 0])
+    queue = Queue([Target(5, MODULE.WEIGHT, 0, 0)] * 3)
+    rest = words([0]), words([0]), words([0]), words([0]), words([0])
+    assert MODULE._apply(6, 1, 3, *queue.arrays, *rest, counts) == 0
+    assert counts[0] == (1 << 30) - 1
 
 
 @pytest.mark.parametrize(("frame", "acts"), [(99, False), (100, True), (101, True)])
 def test_target_acts_from_its_frame_on(frame, acts):
     queue = Queue([Target(100, MODULE.WEIGHT, 2, 77)])
-    weights, counts = words([0] * 4), words([0, 0])
-    rest = words([0]), words([0]), words([0])
-    assert MODULE._apply(frame, 1, *queue.arrays, weights, *rest, counts) == (not acts)
-    assert (weights[2], list(counts)) == (77 * acts, [int(frame > 100), 0])
+    weights, counts = words([0] * 4), words([0, 0, 0, 0])
+    rest = words([0]), words([0]), words([0]), words([0])
+    assert MODULE._apply(frame, 1, 1, *queue.arrays, weights, *rest, counts) == (not acts)
+    assert (weights[2], list(counts)) == (77 * acts, [int(frame > 100), 0, int(acts), 0])
 
 
 places = st.lists(st.integers(0, 3), max_size=4, unique=True).flatmap(
@@ -163,7 +183,7 @@ def test_waiting_targets_follow_what_keeps_its_name_and_are_dropped_with_what_is
     expected = []
     for target in targets:
         keep = keep_live if target.kind & ~NOW == MODULE.LIVE else keep_action
-        if target.index == formats.MASTER:
+        if target.index == formats.MASTER or target.kind & ~NOW == MODULE.GAIN:
             expected.append(target)
         elif target.index in keep:
             expected.append(target._replace(index=keep.index(target.index)))
@@ -182,5 +202,42 @@ def test_queue_refuses_what_does_not_fit_and_tells_its_room():
     assert cues.put(MODULE.WEIGHT, body, 2, 4 + 16 * 5, 64) == 0
     assert cues.count == formats.QUEUE_MAX
     weights = words([0] * 64)
-    cues.apply(7, weights, words([0]), words([0]), words([0]))
+    cues.apply(7, weights, words([0]), words([0]), words([0]), words([0]))
     assert (cues.count, weights[1]) == (0, 2)
+
+
+def test_queue_tells_of_the_last_frame_what_is_news_and_which_channels_got_targets():
+    cues = MODULE.Cues()
+    arrays = words([0] * 4), words([0] * 16), words([0]), words([0] * 4), words([0] * 7)
+    told = []
+    for kind, index, value, indices in (
+        (MODULE.LIVE, 15, 5, 16),
+        (MODULE.GAIN, 6, formats.GAIN4_MAX, formats.BANDS),
+        (MODULE.TEMPO, formats.MASTER, formats.TEMPO_ONE, 4),
+    ):
+        payload = struct.pack("<iBI", -1, index, value)
+        assert cues.put(kind, b"\0\0" + payload, 2, len(payload), indices) == 0
+        cues.apply(9, *arrays)
+        told.append(list(cues.counts[2:]))
+        cues.apply(10, *arrays)
+        told.append(list(cues.counts[2:]))
+    assert told == [[1, 1 << 15], [0, 0], [0, 0], [0, 0], [1, 0], [0, 0]]
+    assert cues.arrivals == 3
+    assert (arrays[1][15], arrays[4][6], arrays[2][0]) == (5, formats.GAIN4_MAX, formats.TEMPO_ONE)
+    assert cues.put(MODULE.GAIN, struct.pack("<BBiBI", 0, 0, -1, 7, 0), 2, 9, formats.BANDS) != 0
+    assert (cues.detail, cues.arrivals) == (1, 3), "what is refused does not arrive"
+
+
+def test_queue_foresees_what_acts_without_losing_it():
+    cues = MODULE.Cues()
+    weights = words([0] * 4)
+    rest = words([0]), words([0]), words([0]), words([0] * 7)
+    for kind, frame, index, value, indices in ((MODULE.GAIN, 5, 0, 1, formats.BANDS), (MODULE.WEIGHT, 7, 2, 9, 4)):
+        payload = struct.pack("<iBI", frame, index, value)
+        assert cues.put(kind, b"\0\0" + payload, 2, len(payload), indices) == 0
+    assert [cues.has_news(frame) for frame in (4, 5, 6, 7, 8)] == [False, False, False, True, True]
+    cues.apply(7, weights, *rest, consume=False)
+    assert (weights[2], cues.count, cues.counts[0], cues.counts[2]) == (9, 2, 0, 1)
+    weights[2] = 0
+    cues.apply(7, weights, *rest)
+    assert (weights[2], cues.count, cues.counts[0], cues.counts[2]) == (9, 0, 1, 1), "the gain came late"

@@ -1,5 +1,7 @@
 """Tables from the wire are not trusted: whatever comes in whatever order, it is stored within the arrays or refused."""
 
+from array import array
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -102,6 +104,13 @@ def test_tables_take_or_refuse_any_parts_in_any_order(has_robot, parts):
     for action in range(formats.ACTIONS_MAX):
         tables.link_repeats(action)
     tables.doubled()
+    for mapping in range(tables._mappings_seen):
+        blinks = tables.function[mapping] in (formats.FUNCTION_BLINK, formats.FUNCTION_RTRIGSIN)
+        assert not (blinks and tables.signal[tables.mapped_dof[mapping]])
+    for live in range(tables._lives_seen):
+        assert tables.live_predict[live] <= formats.PREDICT_KALMAN and tables.live_fade_q15[live] < 32768
+        assert all(0 <= values[live] <= 1 << 27 for values in (tables.live_process_q16, tables.live_noise_q16))
+        assert tables.live_noise_q16[live] or not tables.live_predict[live], "it divides"
     check_motor_tables(tables)
 
 
@@ -147,6 +156,7 @@ GOOD = {
         "high_q15": 32768,
         "speed_q24": 1 << 24,
         "accel_q24": 1 << 24,
+        "signal": 1,
     },
     "character": {"dof": 0, **{f"response{number}_q24": 0 for number in range(6)}},
     "output": {
@@ -263,6 +273,29 @@ def test_beginning_anew_takes_away_what_dofs_and_devices_had():
     assert not any(tables.release_ms) and list(tables.duty_q15) == [32768] * 16
 
 
+@pytest.mark.parametrize("signal", [0, 1])
+def test_dofs_whose_signal_is_processed_are_refused_blinks(signal):
+    tables = MODULE.Tables()
+    tables.begin(*(BEGIN | {"mappings": 9}).values())
+    assert tables.robot(*ROBOT.values()) is None
+    assert tables.mapping(0, 0, formats.FUNCTION_RSIN, 0, 0, 0) == 0, "the DOF comes first"
+    assert tables.dof(*(GOOD["dof"] | {"signal": signal}).values()) is None
+    assert tables.signal[0] == signal
+    for function in (formats.FUNCTION_BLINK, formats.FUNCTION_RTRIGSIN):
+        place = tables._mappings_seen
+        assert tables.mapping(place, 0, function, 0, 0, 0) == (1 if signal else None)
+    assert tables.mapping(tables._mappings_seen, 0, formats.FUNCTION_PROGRAM, 0, 0, 0) is None
+
+
+def test_live_channels_keep_how_they_are_predicted():
+    tables = MODULE.Tables()
+    tables.begin(*(BEGIN | {"lives": 2}).values())
+    assert tables.live(0, 1 << 27, 5, 6, formats.PREDICT_HOLD, 0, 0, 0) is None
+    assert tables.live(1, 1 << 27, 5, 6, formats.PREDICT_KALMAN, 7, 1 << 27, 32767) is None
+    assert list(tables.live_predict[:2]) == [0, 1]
+    assert (tables.live_process_q16[1], tables.live_noise_q16[1], tables.live_fade_q15[1]) == (7, 1 << 27, 32767)
+
+
 def test_settings_are_stored_in_their_place_and_the_rest_is_0():
     tables = loaded(driver=formats.DRIVER_PINS)
     assert list(tables.settings[:6]) == [0] * 6
@@ -331,3 +364,11 @@ def test_curves_and_programs_fill_their_pools_and_no_more():
         assert tables.program(number, program.WORDS_MAX) is None
         assert [tables.word(word) for word in words] == [None] * program.WORDS_MAX
     assert (tables.program(programs, 2), tables.word(0)) == (1, 0)
+
+
+def test_arrays_begin_with_zeros_and_no_more_is_cleared():
+    words, halves = array("i", [-1] * 5), array("H", [65535] * 5)
+    MODULE._clear_words(words, 4)
+    MODULE._clear_halves(halves, 4)
+    assert (list(words), list(halves)) == ([0, 0, 0, 0, -1], [0, 0, 0, 0, 65535])
+    assert (MODULE.words(300), MODULE.halves(300)) == (array("i", [0] * 300), array("H", [0] * 300))

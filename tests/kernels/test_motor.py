@@ -139,7 +139,7 @@ def tables_of(*pins):
     assert tables.begin(30, len(pins), *[0] * 8, 1, 500, 0) is None
     assert tables.robot(TICK_US, 0, KILL_PIN, 0, 0) is None
     for dof, pin in enumerate(pins):
-        assert tables.dof(dof, KIND_ABSOLUTE, VALUE_ONE // 2, 0, VALUE_ONE, POSITION_ONE, POSITION_ONE) is None
+        assert tables.dof(dof, KIND_ABSOLUTE, VALUE_ONE // 2, 0, VALUE_ONE, POSITION_ONE, POSITION_ONE, 1) is None
         assert tables.output(dof, DRIVER_PINS, 1, 16_000, 32_000, 0, VALUE_ONE, halves([pin]), 1) is None
     return tables
 

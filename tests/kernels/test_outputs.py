@@ -31,6 +31,7 @@ ADDRESSES = [
     "_guard",
     "_feed",
     "_bitten",
+    "_usb_is_idle",
     "_keep",
     "_kept",
     "_keep_pose",
@@ -50,6 +51,9 @@ PADS_BANK0 = 0x4001C000
 ADC = 0x4004C000
 PWM = 0x40050000
 TIMER_ALARM3 = 0x4005401C
+USB_CONTROL = 0x50100080
+"""Buffer controls of endpoints, for each one to the host and one from it (data sheet, 4.1.2.5.1)."""
+USB_AVAILABLE, USB_FULL = 1 << 10, 1 << 15
 WATCHDOG = 0x40058000
 GPIO_IN, GPIO_OUT_SET, GPIO_OUT_CLR, GPIO_OE_SET = 0xD0000004, 0xD0000014, 0xD0000018, 0xD0000024
 KEPT = 0x20040000
@@ -313,6 +317,17 @@ def test_watchdog_is_fed_by_its_load_register(memory):
 def test_watchdog_tells_whether_its_time_ran_out(memory, reason, bitten):
     memory.word[WATCHDOG + 8] = reason
     assert BOARD._bitten() == bitten
+
+
+@pytest.mark.parametrize("half", [0, 16])
+def test_usb_is_idle_when_the_host_has_taken_both_halves(memory, half):
+    serial_to_host = USB_CONTROL + 8 * 2
+    memory.word[serial_to_host] = (USB_AVAILABLE | USB_FULL | 64) << half
+    assert not BOARD._usb_is_idle()
+    memory.word[serial_to_host] = (USB_FULL | 64) << half
+    assert BOARD._usb_is_idle()
+    memory.word[serial_to_host + 4] = USB_AVAILABLE  # what comes from the host does not matter
+    assert BOARD._usb_is_idle()
 
 
 @given(st.integers(0, 18), integers(0, 0xFFFF), st.integers(0, 31))

@@ -45,7 +45,18 @@ def open_session(carrier) -> Session:
 
 def begin_performance(mcu, taps=ALL_TAPS) -> Session:
     """Upload the pet, ask for all taps, and start it with some actions; return the session."""
-    session = open_session(VirtualCarrier(mcu))
+    return begin_performance_over(VirtualCarrier(mcu), taps)
+
+
+def begin_performance_over(carrier, taps=ALL_TAPS) -> Session:
+    """Do that over a carrier."""
+    session = open_session(carrier)
+    begin_performance_on(session, taps)
+    return session
+
+
+def begin_performance_on(session, taps=ALL_TAPS) -> None:
+    """Do that in a session that is open."""
     session.upload(pet_tables())
     session.telemetry(taps, 1, 0)
     session.weight_targets(0, {0: formats.WEIGHT_ONE, 1: formats.WEIGHT_ONE // 2, 2: 3 * formats.WEIGHT_ONE})
@@ -53,4 +64,3 @@ def begin_performance(mcu, taps=ALL_TAPS) -> Session:
     session.tempo(40, formats.MASTER, formats.TEMPO_ONE * 3 // 2)
     session.start()
     session.flush()
-    return session

@@ -4,9 +4,11 @@ import itertools
 
 import pytest
 
+from marotte.link import VirtualCarrier
 from marotte.mcu.raw_repl import RawRepl
 from marotte.mcu.unix import UnixMcu
 from marotte.pulses import pulses
+from marotte.session import DICTIONARY, GREETING_US, OPEN_TIMEOUT_S, LinkForeign, Session
 from tests.link.stage import FRAME_US, begin_performance
 
 RAW_BANNER = b"raw REPL; CTRL-B to exit\r\n>"
@@ -29,6 +31,7 @@ def answer(mcu, wait_us=300_000):
     return b"".join(data for _, data in mcu.receive())
 
 
+@pytest.mark.images
 @pytest.mark.parametrize(
     "pieces",
     [
@@ -105,3 +108,23 @@ def test_firmware_performs_again_after_the_repl(performing):
     rises = [pulse.start_ns for pulse in pulses(mcu.edges(2))]
     assert len(rises) >= 8
     assert {b - a for a, b in itertools.pairwise(rises)} == {20_000_000}
+
+
+@pytest.mark.parametrize(
+    ("dictionary", "timeout_s"),
+    [
+        (DICTIONARY, 256 * GREETING_US / 1e6),  # so that each number has its turn
+        (0xE4B06CE6, OPEN_TIMEOUT_S),  # with these two some of the first numbers are unfit
+        (0xAFBD67F9, OPEN_TIMEOUT_S),
+    ],
+    ids=["all numbers", "e4b06ce6", "afbd67f9"],
+)
+def test_greetings_neither_restart_nor_leave_a_repl(performing, monkeypatch, dictionary, timeout_s):
+    monkeypatch.setattr("marotte.session.DICTIONARY", dictionary)
+    mcu, _ = performing
+    RawRepl(mcu).exec("kept = 6 * 7")
+    mcu.send(b"\x02")
+    mcu.run_for(10_000)
+    with pytest.raises(LinkForeign, match="MicroPython's REPL answers at this port"):
+        Session(VirtualCarrier(mcu)).open(timeout_s)
+    assert RawRepl(mcu).exec("print(kept)").strip() == "42"

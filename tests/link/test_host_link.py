@@ -15,12 +15,14 @@ from marotte.link import (
     Link,
     LinkRefused,
     LinkSilent,
+    LinkTaken,
     pack,
     wire_packet,
 )
-from marotte.session import DICTIONARY, OPEN_TIMEOUT_S, LinkForeign, Session
-from shared import messages
+from marotte.session import DICTIONARY, OPEN_TIMEOUT_S, PING_US, LinkForeign, Session
+from shared import formats, messages
 from tests.link.carriers import ScriptedCarrier, ack
+from tests.link.safety import puppet_text, tables_of
 
 STEP_US = 1000
 DELAY_US = 3000
@@ -137,6 +139,68 @@ def test_link_repeats_all_that_follow_a_lost_command_in_their_order():
     assert waited_us < RETRY_US / 2, "a gap that the MCU reports is filled at once"
 
 
+def test_link_asks_at_once_for_an_answer_that_was_lost():
+    link, carrier, _ = link_to(lambda number, _, seq: (b"" if number == 0 else ack(seq), DELAY_US))
+    for _ in range(WINDOW):
+        link.post("ping")
+    waited_us = settle(link)
+    assert [seq for _, seq, _ in carrier.arrived] == [*range(WINDOW), 0]
+    assert waited_us < RETRY_US / 2, "the answer to a later one tells that it was carried out"
+
+
+def test_link_tells_the_refusals_of_answers_that_overtook_others_in_the_order_of_the_commands():
+    def script(number, message_id, seq):
+        return (b"" if number == 0 else ack(seq, messages.RANGE, seq), DELAY_US)
+
+    link, _, _ = link_to(script)
+    told = []
+    for _ in range(WINDOW):
+        link.post("ping", on_refused=lambda status, detail: told.append(detail))
+    settle(link)
+    assert told == list(range(WINDOW))
+
+
+def test_link_repeats_an_urgent_command_whatever_waits_before_it():
+    link, carrier, _ = link_to(lambda *_: (b"", 0))
+    link.post("ping")
+    link.post("kill", urgent=True)
+    for _ in range(2 * RETRY_US // STEP_US):
+        link.pump(STEP_US)
+    sent = [message_id for message_id, _, _ in carrier.arrived]
+    assert sent.count(messages.KILL) >= 2
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [lambda seq: ack(seq, messages.RESEND, (seq + 100) & 255), lambda seq: ack((seq + 50) & 255)],
+    ids=["gaps of others", "answers to others"],
+)
+def test_link_that_is_never_answered_says_so_although_the_mcu_can_be_heard(answer):
+    link, carrier, _ = link_to(lambda number, _, seq: (answer(seq), DELAY_US))
+    link.post("ping")
+    with pytest.raises(LinkTaken, match="does another program use this port"):
+        settle(link)
+    assert carrier.now_us() == pytest.approx(SILENT_US, abs=2 * STEP_US)
+
+
+def test_link_drops_the_beginning_of_a_packet_whose_end_was_lost():
+    def script(number, message_id, seq):
+        return (ack(seq)[:-1] if number == 0 else ack(seq), DELAY_US)
+
+    link, carrier, _ = link_to(script)
+    link.post("ping")
+    assert settle(link) == pytest.approx(RETRY_US + DELAY_US, abs=2 * STEP_US)
+    assert len(carrier.arrived) == 2 and link.counters.damaged == 1
+
+
+def test_link_waits_for_the_answers_that_came_while_the_host_was_suspended():
+    link, carrier, _ = link_to(lambda number, _, seq: (ack(seq), 10 * SILENT_US + 2 * STEP_US))
+    link.post("ping")
+    link.pump(STEP_US)
+    carrier.read(10 * SILENT_US)  # the time in which nobody looked
+    settle(link)
+
+
 def test_link_hurries_once_for_all_that_report_a_gap():
     def script(number, message_id, seq):
         return (
@@ -251,6 +315,13 @@ def test_session_opens_although_greetings_are_lost(lost):
     session.flush()
 
 
+def test_greeting_is_sent_although_no_number_suits_it():
+    link, carrier, _ = link_to(faithful)
+    link.post("hello", {"protocol": messages.PROTOCOL, "dictionary": 0x03030303})
+    settle(link)
+    assert carrier.arrived[0][:2] == (messages.HELLO, 0)
+
+
 def test_session_with_nobody_says_so_within_two_seconds():
     carrier = ScriptedCarrier(lambda *_: (b"", 0))
     with pytest.raises(LinkSilent, match=r"no answer within 1.5 s: is the firmware running"):
@@ -303,8 +374,18 @@ def test_session_pings_when_it_has_nothing_to_say():
     for _ in range(500):
         session.pump(2000)
     pings = [at_us for message_id, _, at_us in carrier.arrived if message_id == messages.PING]
-    assert 9 <= len(pings) <= 10
+    assert len(pings) == 1_000_000 // PING_US
     assert max(b - a for a, b in itertools.pairwise(pings)) < 200_000
+
+
+def test_session_pings_more_often_where_the_mcu_is_soon_to_find_the_link_silent():
+    carrier = ScriptedCarrier(faithful)
+    session = Session(carrier)
+    session.upload(tables_of(puppet_text(["A"]), "link_timeout = 0.1"))
+    for _ in range(500):
+        session.pump(2000)
+    pings = [at_us for message_id, _, at_us in carrier.arrived if message_id == messages.PING]
+    assert max(b - a for a, b in itertools.pairwise(pings)) < 40_000
 
 
 def test_session_splits_targets_into_messages_that_fit():
@@ -313,3 +394,23 @@ def test_session_splits_targets_into_messages_that_fit():
     session.weight_targets(9, {action: action << 20 for action in range(64)})
     session.flush()
     assert [message_id for message_id, _, _ in carrier.arrived] == [messages.WEIGHT_TARGETS] * 5
+
+
+def test_session_sends_the_newest_of_the_targets_that_wait():
+    carrier = ScriptedCarrier(faithful)
+    session = Session(carrier)
+    refused = []
+    for _ in range(WINDOW):
+        session.stop()
+    for value in range(5):
+        session.weight_targets(formats.FRAME_NOW, {1: value, 2: value}, refused.append)
+        session.live_targets(formats.FRAME_NOW, {1: value}, refused.append)
+        session.weight_targets(100 + value, {1: value})
+    session.weight_targets(formats.FRAME_NOW, {1: 9})
+    session.flush()
+    sent = [message_id for message_id, _, _ in carrier.arrived][WINDOW:]
+    assert sent.count(messages.LIVE_TARGETS) == 1, "one for all"
+    assert sent.count(messages.WEIGHT_TARGETS) == 5 + 2, (
+        "stamped ones are sent all, and of the others what is not superseded"
+    )
+    assert refused == []

@@ -52,7 +52,7 @@ def wide_tables():
         ]
         yield "mappings", {"first_mapping": first}, items
     for live in range(16):
-        yield "live", {"live": live, "rest_q28": 1 << 27, "rise_q26": 1 << 22, "fall_q26": 1 << 22}, []
+        yield "live", GOOD["live"] | {"live": live, "rest_q28": 1 << 27}, []
     yield "commit", {}, []
 
 
@@ -139,6 +139,63 @@ def test_command_after_a_gap_is_answered_with_the_number_expected(mcu):
     assert told == [((expected + ahead) & 255, messages.RESEND, expected) for ahead in (1, 2, 100, 239)]
 
 
+def hello(seq):
+    return wire_packet(
+        messages.HELLO, seq & 255, pack("hello", {"protocol": messages.PROTOCOL, "dictionary": DICTIONARY})
+    )
+
+
+def test_greeting_that_was_repeated_or_overtaken_on_its_way_begins_no_session(mcu):
+    session = open_session(VirtualCarrier(mcu))
+    greeting = session.link._seq - 1
+    session.weight_targets(1000, {})
+    session.flush()
+    mcu.send(hello(greeting) + hello(greeting - 1) + hello(greeting - 7))
+    session.pump(1_000)
+    session.link.post("ping")
+    session.flush()
+    assert session.link.counters.repeated == 0, "the session goes on with its numbers"
+
+
+def test_greeting_with_the_number_of_the_last_one_begins_a_session_later(mcu):
+    session = open_session(VirtualCarrier(mcu))
+    greeting = session.link._seq - 1
+    session.link.post("ping")
+    session.flush()
+    mcu.run_for(600_000)
+    mcu.send(hello(greeting) + wire_packet(messages.STOP, (greeting + 1) & 255, b""))  # where a ping was before
+    mcu.run_for(10_000)
+    answers = [body for _, body in mcu.receive()]
+    assert acknowledged(answers[0]) == (greeting & 255, messages.OK, 0)
+    assert acknowledged(answers[-1]) == ((greeting + 1) & 255, messages.OK, 0)
+
+
+def test_command_of_another_host_is_not_taken_for_one_that_was_carried_out(mcu):
+    session = open_session(VirtualCarrier(mcu))
+    session.link.post("stop")
+    session.flush()
+    expected = session.link._seq
+    other = wire_packet(messages.WEIGHT_TARGETS, (expected - 1) & 255, pack("weight_targets", {"frame": 9}, []))
+    mcu.send(other)
+    mcu.run_for(10_000)
+    assert [acknowledged(answer) for _, answer in mcu.receive()] == [((expected - 1) & 255, messages.RESEND, expected)]
+
+
+def test_targets_that_find_no_place_are_counted(mcu):
+    session = open_session(VirtualCarrier(mcu))
+    session.upload(pet_tables())
+    session.start()
+    refused = []
+    for number in range(formats.QUEUE_MAX // 10 + 3):
+        session.weight_targets(10_000 + number, dict.fromkeys(range(10), 0), lambda *_: refused.append(10))
+    session.flush()
+    assert sum(refused) == 30
+    assert session.status()["refused_targets"] == 30
+    session.start()
+    session.flush()
+    assert session.status()["refused_targets"] == 0
+
+
 def test_mcu_without_a_session_answers_nothing_but_a_greeting(mcu):
     for message_id in (messages.PING, messages.ARM, messages.START, messages.STATUS_REQUEST):
         mcu.send(wire_packet(message_id, 0, b""))
@@ -153,11 +210,12 @@ def test_mcu_without_a_session_answers_nothing_but_a_greeting(mcu):
     ("protocol", "dictionary"), [(messages.PROTOCOL + 1, DICTIONARY), (messages.PROTOCOL, DICTIONARY ^ 1)]
 )
 def test_other_version_is_refused_with_both_numbers(mcu, monkeypatch, protocol, dictionary):
+    theirs = messages.PROTOCOL
     monkeypatch.setattr("marotte.session.DICTIONARY", dictionary)
     monkeypatch.setattr(messages, "PROTOCOL", protocol)
     with pytest.raises(LinkForeign) as refusal:
         Session(VirtualCarrier(mcu)).open()
-    assert f"the firmware speaks protocol 2, dictionary {DICTIONARY:08x}" in str(refusal.value)
+    assert f"the firmware speaks protocol {theirs}, dictionary {DICTIONARY:08x}" in str(refusal.value)
     assert f"this program speaks protocol {protocol}, dictionary {dictionary:08x}" in str(refusal.value)
 
 
@@ -209,6 +267,7 @@ GOOD = {
         "high_q15": 32768,
         "speed_q24": 1 << 24,
         "accel_q24": 1 << 24,
+        "signal": 0,
     },
     "character": {
         "dof": 0,
@@ -252,7 +311,16 @@ GOOD = {
         "cycles": 1000,
     },
     "mapping": {"dof": 0, "function": 0, "argument": 0, "low_q15": 0, "high_q15": 0},
-    "live": {"live": 0, "rest_q28": 0, "rise_q26": 1 << 20, "fall_q26": 1 << 20},
+    "live": {
+        "live": 0,
+        "rest_q28": 0,
+        "rise_q26": 1 << 20,
+        "fall_q26": 1 << 20,
+        "predict": formats.PREDICT_KALMAN,
+        "process_q16": 1 << 18,
+        "noise_q16": 1 << 8,
+        "fade_q15": 32767,
+    },
     "curve": {"curve": 0, "samples": 2},
     "program": {"program": 0, "words": 2},
     "blink": {"blink": 0, "threshold_q16": 1 << 16, "gap_q18": 1000 << 18},
@@ -283,6 +351,7 @@ BAD_FIELDS = [
     *(("dof", name, value) for name, value in [("high_q15", 32769), ("low_q15", 32769), ("low_q15", 65535)]),
     *(("dof", name, value) for name in ("speed_q24", "accel_q24") for value in (0, (1 << 24) + 1, 0xFFFFFFFF)),
     ("dof", "accel_q24", 1),
+    *(("dof", "signal", value) for value in (2, 255)),
     *(("character", "dof", value) for value in (1, 255)),
     *(
         ("character", name, value)
@@ -316,6 +385,9 @@ BAD_FIELDS = [
     *(("mapping", name, value) for name, value in [("low_q15", 32769), ("high_q15", 32769)]),
     *(("live", name, value) for name, value in [("live", 1), ("live", 255), ("rest_q28", (1 << 28) + 1)]),
     *(("live", name, value) for name, value in [("rest_q28", 0xFFFFFFFF), ("rise_q26", 0), ("fall_q26", 1 << 26)]),
+    *(("live", name, value) for name, value in [("predict", 2), ("predict", 255), ("fade_q15", 32768)]),
+    *(("live", name, value) for name in ("process_q16", "noise_q16") for value in ((1 << 27) + 1, 0xFFFFFFFF)),
+    ("live", "noise_q16", 0),
     *(("curve", name, value) for name, value in [("curve", 1), ("samples", 1), ("samples", 257)]),
     *(("program", name, value) for name, value in [("program", 1), ("words", 0), ("words", 129)]),
     *(
@@ -393,6 +465,20 @@ def test_mapping_with_an_argument_out_of_range_is_refused(loaded, function, argu
         assert refused(session, *part) is None
     item = GOOD["mapping"] | {"function": function, "argument": argument}
     expected = None if taken else (messages.RANGE, 3)
+    assert refused(session, "mappings", {"first_mapping": 0}, [item]) == expected
+    assert play(session) == first_taps
+
+
+@pytest.mark.parametrize("function", [formats.FUNCTION_BLINK, formats.FUNCTION_RTRIGSIN])
+@pytest.mark.parametrize("signal", [0, 1])
+def test_blink_on_a_dof_whose_signal_is_processed_is_refused(loaded, function, signal):
+    session, first_taps = loaded
+    begin = GOOD["begin"] | {"dofs": 1}
+    for part in (("begin", begin), ("robot", GOOD["robot"]), ("dof", GOOD["dof"] | {"signal": signal})):
+        assert refused(session, *part) is None
+    assert refused(session, "action", GOOD["action"]) is None
+    item = GOOD["mapping"] | {"function": function}
+    expected = (messages.RANGE, 2) if signal else None
     assert refused(session, "mappings", {"first_mapping": 0}, [item]) == expected
     assert play(session) == first_taps
 
@@ -569,6 +655,11 @@ def raw(session, message_id, payload):
         ("tempo", 5, [{"action": 255, "tempo_q16": 16383}], 2),
         ("tempo", 5, [{"action": 255, "tempo_q16": 262145}], 2),
         ("tempo", 5, [{"action": 255, "tempo_q16": 0x80000000}], 2),
+        ("gains", -2, [], 0),
+        ("gains", 5, [{"band": 7, "gain4_q16": 0}], 1),
+        ("gains", 5, [{"band": 6, "gain4_q16": 8 << 16}, {"band": 255, "gain4_q16": 0}], 3),
+        ("gains", 5, [{"band": 0, "gain4_q16": (8 << 16) + 1}], 2),
+        ("gains", 5, [{"band": 0, "gain4_q16": 0}, {"band": 1, "gain4_q16": 0xFFFFFFFF}], 4),
     ],
 )
 def test_targets_out_of_range_are_refused_whole(loaded, name, frame, items, detail):

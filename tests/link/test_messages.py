@@ -35,6 +35,8 @@ COUNTS = {
     *("ticks", "attached", "released", "stalled", "killed_by", "bus_errors", "bus_gone", "resets", "store"),
     *("bytes", "crc32", "place", "byte"),
     *("dofs_max", "actions_max", "mappings_max", "lives_max", "queue_max", "late_frames", "late_targets", "heap_free"),
+    "refused_targets",
+    *("signal", "predict", "band", "clipped"),
 }
 """Counts, indices, flags and bit sets: what has no unit."""
 

@@ -205,6 +205,7 @@ BEGIN = {
 }
 ROBOT = {"motor_period_us": 20000, "attach_ms": 100, "kill_pin": formats.NO_PIN, "kill_level": 0, "autostart": 0}
 DOF = {"dof": 0, "kind": 0, "rest_q15": 0, "low_q15": 0, "high_q15": 32768, "speed_q24": 1 << 24, "accel_q24": 1 << 24}
+DOF |= {"signal": 1}
 OUTPUT = {"dof": 0, "driver": 0, "turns": 1, "end0_q4us": 16000, "end1_q4us": 32000, "dead_q15": 0, "top_q15": 32768}
 ACTION = {"action": 0, "tempo_q16": 65536, "rise_q26": 1 << 20, "fall_q26": 1 << 20, "first_mapping": 0}
 ACTION |= {"mappings": 1, "entry": 0, "warp_q26": 1 << 20, "cycles": 0}

@@ -225,9 +225,9 @@ class Told:
         board = SimpleNamespace(heap_free=lambda: 0)
         self.telemetry = load_checked("firmware/telemetry.py").Telemetry(board, self.puppet, self)
 
-    def send(self, message_id, length):
+    def send(self, message_id, length, is_telemetry):
         frame, taps, *values = struct.unpack(f"<iB{(length - 7) // 2}H", self.out[2:length])
-        assert (message_id, taps, values) == (messages.TAPS, 7, [frame, frame, frame])
+        assert (message_id, is_telemetry, taps, values) == (messages.TAPS, True, 7, [frame, frame, frame])
         self.frames.append(frame)
 
     def step(self, tapped):

@@ -128,6 +128,9 @@ def converse(mcu, session, tables, frames):
         if step % 40 == 8:
             tempo_q16 = rng.randrange(formats.TEMPO_ONE // 2, 2 * formats.TEMPO_ONE)
             session.tempo(formats.FRAME_NOW, rng.choice((0, 1, 2, formats.MASTER)), tempo_q16)
+        if step % 40 == 12:
+            gains4_q16 = {band: rng.randrange(formats.GAIN4_MAX + 1) for band in range(formats.BANDS)}
+            session.gains(formats.FRAME_NOW, gains4_q16)
         if step % 20 == 5:
             output = rng.choice(list(robot.outputs.values()))
             ends_us = tuple(rng.uniform(1000, 2000) for _ in range(2))

@@ -215,12 +215,16 @@ class Show:
         puppet = self.tables.puppet
         for number in range(12):
             level = formats.WEIGHT_ONE - number
-            self.session.weight_targets(
-                formats.FRAME_NOW, dict.fromkeys(range(len(puppet.actions)), level), lambda *_: None
-            )
-            self.session.live_targets(
-                formats.FRAME_NOW, dict.fromkeys(range(len(puppet.lives)), level), lambda *_: None
-            )
+            for name, index, count in (
+                ("weight_targets", "action", len(puppet.actions)),
+                ("live_targets", "live", len(puppet.lives)),
+            ):
+                items = [{index: place, "target_q28": level} for place in range(count)]
+                for start in range(
+                    0, count, 15
+                ):  # each by itself: a session would leave out what a later one supersedes
+                    part = (name, {"frame": formats.FRAME_NOW}, items[start : start + 15])
+                    post(self.session, [part])
 
     def lost(self):
         """A packet that was lost, and others behind it, which the MCU refuses."""
@@ -278,8 +282,6 @@ def test_kill_from_the_host_acts_within_20_ms_and_a_tick(mcu_of, line, doing):
 
 
 NOT_READ_US = (400_000, 1_000_000)
-BLOCKED_US = 1_100_000
-"""What a write over USB may take when nobody reads: then what cannot be sent is dropped."""
 
 
 @pytest.mark.parametrize("not_read_us", NOT_READ_US)
@@ -310,7 +312,7 @@ def test_ticks_go_on_while_the_host_does_not_read(mcu_of, not_read_us):
 
 @pytest.mark.parametrize("not_read_us", NOT_READ_US)
 def test_kills_act_while_the_host_does_not_read(mcu_of, not_read_us):
-    """The kill pin within a tick as ever; a kill from the host as soon as the main loop is through with what it cannot send."""
+    """As ever, since the main loop drops what it cannot send."""
     mcu = mcu_of("usb")
     mcu.set_pin(KILL_PIN, 1)
     session = open_session(VirtualCarrier(mcu))
@@ -327,7 +329,7 @@ def test_kills_act_while_the_host_does_not_read(mcu_of, not_read_us):
             mcu.set_pin(KILL_PIN, 0)
         else:
             session.kill()
-        mcu.run_for(BLOCKED_US + 100_000)
+        mcu.run_for(200_000)
         took_us[killer] = last_fall_us(mcu, [FREE_PIN], called_us) - called_us
         mcu.set_host_reading(True)
         mcu.set_pin(KILL_PIN, 1)
@@ -338,7 +340,7 @@ def test_kills_act_while_the_host_does_not_read(mcu_of, not_read_us):
         + ", ".join(f"{k} {v / 1000:.1f} ms" for k, v in took_us.items())
     )
     assert took_us["pin"] <= PERIODS_US[333] + HANDLED_US
-    assert took_us["host"] <= BLOCKED_US + KILL_US + PERIODS_US[333]
+    assert took_us["host"] <= KILL_US + PERIODS_US[333]
 
 
 # ---- exchanges on a slow line
@@ -364,6 +366,7 @@ def test_exchanges_of_16_dofs_at_333_hz_over_a_uart_lose_nothing(mcu_of):
     session = open_session(VirtualCarrier(mcu))
     begin(session, tables[0])
     drive(session)
+    repeated = session.link.counters.repeated
     for number in range(EXCHANGES):
         playing, new = tables[number % 2], tables[(number + 1) % 2]
         parts, commit = exchange_parts(new, playing)
@@ -381,6 +384,6 @@ def test_exchanges_of_16_dofs_at_333_hz_over_a_uart_lose_nothing(mcu_of):
         f"{EXCHANGES} exchanges: {lost} characters lost, {status['damaged']} packets damaged, ticks at most "
         f"{status['tick_late_max_us']} us late and {status['tick_max_us']} us long, {status['late_frames']} frames late"
     )
-    assert (lost, status["damaged"], session.link.counters.repeated) == (0, 0, 0)
+    assert (lost, status["damaged"], session.link.counters.repeated) == (0, 0, repeated)
     assert status["tick_late_max_us"] < PERIODS_US[333] + CAUGHT_UP_US
     assert status["attached"] == 0xFFFF

@@ -29,12 +29,23 @@ SMALL_INT_FUNCTIONS = (
         "Actions", "compute_phases", "follow_tempos", "end_gestures", "enter", "warp", "_phases", "_nominal", "_place"
     ),
     *methods("Blinks", "enter", "evaluate", "exchange"),
-    *methods("Programs", "evaluate"),
-    *methods("Exchange", "carry_over", "_swap"),
-    *methods("Puppet", "start", "stop", "prepare", "step", "_synthesise", "_rest"),
+    *methods("Programs", "evaluate", "add"),
+    *methods("Kalman", "step", "is_moving"),
+    *methods("SignalProcessing", "glide", "process", "bypass", "note", "follow"),
+    *methods("Outlook", "take", "write", "sketch", "_advance_phases", "_first_end", "_end_gestures"),
+    *methods("Foresight", "evaluate"),
+    *methods("Budget", "weigh", "news_us", "frames"),
+    *methods("Rings", "read", "write", "write_block", "fill", "smooth", "bend", "split", "exchange"),
+    *methods(
+        "Future", "has_news", "before_news", "advance", "work", "finish", "relent", "need_us", "expect_news", "sketch_before",
+        "exchange", "_sketch", "_recall", "_begin", "_differ", "_bend_near", "_bend_far", "_bend", "_compute_some", "_wanted",
+        "_compute",
+    ),
+    *methods("Exchange", "carry_over", "_carry_synthesis", "_swap"),
+    *methods("Puppet", "start", "stop", "prepare", "step", "expects_news", "_synthesise", "_rest", "_work", "_has_heard", "_expect"),
     *methods(
         "Motor", "exchange", "start", "stand", "put", "heard", "arm", "kill", "limit", "attach", "detach", "derive",
-        "attend", "_rearrange", "_tick", "_steps", "_tap", "_stand", "_hold_unattached",
+        "attend", "_rearrange", "_gather", "_tick", "_steps", "_tap", "_stand", "_hold_unattached",
     ),
     *methods("Ring", "put", "rearrange"),
     *methods(
@@ -50,12 +61,13 @@ SMALL_INT_FUNCTIONS = (
     *methods("BridgeDriver", "attach", "release", "write", "_write", "quiet"),
     *methods("Pca9685Driver", "attach", "release", "flush", "attend", "quiet", "_enable", "_switch", "_wanted"),
     *methods("_Chip", "attach", "release", "quiet", "flush", "attend", "_set_up", "gone", "_transfer"),
-    *methods("Link", "poll", "report", "send", "_packet", "_answer"),
-    *methods("Commands", "carry_out", "_queue"),
+    *methods("Link", "poll", "report", "send", "_packet", "_answer", "_drop"),
+    *methods("Commands", "carry_out", "_queue", "_refuse"),
     *methods(
         "Commands", "_on_weight_targets", "_on_live_targets", "_on_tempo", "_on_telemetry", "_on_start", "_on_stop", "_on_ping",
-        "_on_arm", "_on_kill",
+        "_on_arm", "_on_kill", "_on_hello", "_on_calibrate", "_on_limit",
     ),
+    "_half", "_word", *methods("Tables", "bad_limit", "_bad_limit", "limit", "bad_calibration", "_bad_calibration", "calibrate"),
     *methods("Telemetry", "report", "_report_taps", "_send_taps", "_pack_frame"),
 )
 """What runs while a puppet plays: a larger integer would allocate on a 32-bit port."""

@@ -9,7 +9,7 @@ import numpy
 
 import marotte
 from marotte.emulated import connected
-from tests.generate import add_random_dynamics, random_puppet, random_score, to_toml
+from tests.generate import add_random_dynamics, add_random_gains, random_puppet, random_score, to_toml
 
 TAPS = ("base", "signal", "motor")
 
@@ -33,6 +33,15 @@ def random_case(seed, seconds, draw=0, **options):
     score = random_score(rng, puppet, seconds, level="full", gains=False)
     add_random_dynamics(rng, puppet)
     return Case(f"seed {seed}.{draw}", puppet, score)
+
+
+def random_gains_case(seed, seconds, reach, draw=0, **options):
+    """Return the random case that a seed stands for, with band gains within -reach..reach and no dynamics."""
+    rng = random.Random(f"gains {seed}.{draw}")
+    puppet = random_puppet(rng, level="full", gains=False, **options)
+    score = random_score(rng, puppet, seconds, level="full", gains=False)
+    add_random_gains(rng, puppet, score, seconds, reach)
+    return Case(f"seed {seed}.{draw} within {reach}", puppet, score)
 
 
 def load(case):

@@ -60,7 +60,10 @@ def assert_case_is_right(case, seconds, expected):
     """Play a case, hold its taps against the definitions, the motor tap against its range; return its fractions of the bounds."""
     rendering = play(case, seconds)
     base = tap(rendering, "base")
-    assert numpy.array_equal(base, tap(rendering, "signal")), f"{case.name}: with all gains 1 the signal is the base"
+    if not any("gains" in part for part in (*case.puppet.get("mood", {}).values(), *case.score["cue"])):
+        assert numpy.array_equal(base, tap(rendering, "signal")), (
+            f"{case.name}: with all gains 1 the signal is the base"
+        )
     low, high = numpy.array([dof.limits for dof in rendering.puppet.dofs.values()]).T
     rounding = 1 / 32768  # limits are rounded to the format of values
     motor = tap(rendering, "motor")

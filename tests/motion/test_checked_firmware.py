@@ -5,12 +5,15 @@ import pytest
 
 from tests.corners import corners
 from tests.corners_full import full_corners
+from tests.corners_signal import signal_corners
 from tests.motion.checked_mcu import CheckedMcu
 from tests.motion.playing import TAPS, Case, play, random_case, tap
 
 NAMED = ("everything at once", "cues of one frame", "one of each function", "a tempo with every frame")
 CORNERS = [Case(*corner) for corner in (*corners(), *full_corners()) if corner.name in NAMED]
-CASES = [(case, 4) for case in CORNERS] + [(random_case(seed, 4), 4) for seed in range(300, 303)]
+GAINS_CORNERS = [Case(*corner) for corner in signal_corners(4) if corner.name in ("moods", "wheels turning round")]
+RANDOM_CASES = [random_case(seed, 4) for seed in range(300, 303)]
+CASES = [(case, 4) for case in (*CORNERS, *GAINS_CORNERS, *RANDOM_CASES)]
 
 
 @pytest.mark.parametrize(("case", "seconds"), CASES, ids=[case.name for case, _ in CASES])

@@ -22,10 +22,11 @@ from marotte.rendering import Rendering
 from marotte.wiring import Robot
 from tests.corners import corners
 from tests.corners_full import full_corners
+from tests.corners_signal import signal_corners
 from tests.generate import random_robot
-from tests.motion.playing import TAPS, Case, load, random_case, tap
+from tests.motion.playing import TAPS, Case, load, random_case, random_gains_case, tap
 
-SEEDS = range(200, 220)
+SEEDS, GAINS_SEEDS = range(200, 220), range(220, 224)
 SECONDS = 5
 WORKERS = 2
 
@@ -57,7 +58,7 @@ class Played(NamedTuple):
 
 
 def identity_cases():
-    """Return the cases: random ones with a robot, and the corners with the largest and the smallest numbers."""
+    """Return the cases: random ones with a robot, corners with the largest and the smallest numbers, and band gains."""
     cases = []
     for seed in SEEDS:
         case = random_case(seed, SECONDS)
@@ -74,7 +75,9 @@ def identity_cases():
         "phases behind the master's",
         "blink after re-entry",
     )
-    return cases + [Case(*corner) for corner in (*corners(), *full_corners()) if corner.name in named]
+    cases += [Case(*corner) for corner in (*corners(), *full_corners()) if corner.name in named]
+    cases += [random_gains_case(seed, SECONDS, 4, dofs=5, actions=8) for seed in GAINS_SEEDS]
+    return cases + [Case(*corner) for corner in signal_corners(4) if corner.name in ("leaps of the master", "moods")]
 
 
 CASES = identity_cases()
@@ -113,6 +116,8 @@ def test_renderings_are_identical_to_the_bit_on_all_mcus(played, number):
     renderings = played[number].result().renderings
     late = [rendering.status["late_frames"] for rendering in renderings.values()]
     assert not any(late), "the motor layer had to guess"
+    cut_short = [rendering.status["cut_short"] for rendering in renderings.values()]
+    assert not any(cut_short), "there was no time for the future"
     for name in TAPS:
         expected = tap(renderings["unix"], name)
         for kind in ("reference", "unix32", "rp2040"):

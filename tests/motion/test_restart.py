@@ -3,18 +3,23 @@
 The motors begin where they are, not at rest; the difference dies out.
 """
 
+import pytest
+
 import marotte
 from marotte.link import VirtualCarrier
 from marotte.mcu.unix import UnixMcu
 from marotte.prompter import Prompter
 from shared.formats import TAP_BASE, TAP_MOTOR, TAP_SIGNAL
-from tests.motion.playing import load, random_case
+from tests.motion.playing import load, random_case, random_gains_case
 
 FRAMES = 60
 
 
-def test_motion_begun_again_repeats_to_the_bit():
-    puppet, score, _ = load(random_case(20, 2, dofs=10))
+@pytest.mark.parametrize(
+    "case", [random_case(20, 2, dofs=10), random_gains_case(1, 2, 4, dofs=10)], ids=["plain", "gains"]
+)
+def test_motion_begun_again_repeats_to_the_bit(case):
+    puppet, score, _ = load(case)
     wheels = [place for place, dof in enumerate(puppet.dofs.values()) if dof.is_relative]
     assert wheels and puppet.lives
     first, second = two_performances(puppet, score, FRAMES)

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 PET = str(ROOT / "puppets" / "pet.toml")
 SCORE = str(ROOT / "puppets" / "pet-score.toml")
 ROBOT = str(ROOT / "puppets" / "pet-robot.toml")
-COMMANDS = ("check", "render", "run", "save", "calibrate", "ports", "mcu")
+COMMANDS = ("check", "render", "plot", "run", "save", "calibrate", "ports", "mcu", "link")
 
 
 @pytest.fixture
@@ -72,12 +72,26 @@ def test_check_says_what_is_fine(run):
     assert (status, err) == (0, "")
     lines = out.splitlines()
     assert lines[0].startswith(f"{PET}: a puppet with 10 DOFs, ") and lines[0].endswith(": fine")
+    lines = [line for line in lines if not line.startswith(("  bands", "  gains"))]
     assert re.fullmatch(re.escape(SCORE) + r": a score of \d+ cues, 20 s: fine", lines[1])
     assert lines[2] == f"{ROBOT}: a robot with 10 outputs: fine"
     assert lines[3] == "  motor layer: a tick every 20000 us, 50 Hz"
     words = "EYEBROW GP2 every 20000 us, written at 50 Hz range 0..1, speed 10, accel 200"
     assert " ".join(lines[4].split()) == words
     assert len(lines) == 4 + 10
+
+
+def test_check_shows_the_bands_at_the_frame_rate_and_the_gains_of_moods(run, tmp_path):
+    puppet = tmp_path / "p.toml"
+    puppet.write_text(
+        "frame_rate = 60\n[dof.A]\n[mood.SHY]\ngains = [-0.5, 2, 1.25, 1, 1, 0, 4]\n[mood.M]\ntempo = 2\n"
+    )
+    _, *lines = run("check", puppet)[1].splitlines()
+    assert lines == [
+        "  bands, in Hz    30  8.4   4.0  2.0  0.99  0.49  0.25",
+        "  gains of SHY  -0.5    2  1.25    1     1     0     4",
+        "  gains of M       1    1     1    1     1     1     1  tempo 2",
+    ]
 
 
 def test_check_shows_the_limits_in_use_and_the_real_periods(run, tmp_path):
@@ -90,8 +104,8 @@ def test_check_shows_the_limits_in_use_and_the_real_periods(run, tmp_path):
         '[output.W]\ndriver = "bridge"\npwm = 2\ndirection = 3\n'
     )
     lines = run("check", puppet, robot)[1].splitlines()
-    assert lines[2] == "  motor layer: a tick every 3008 us, 332.4 Hz"
-    assert lines[3:] == [
+    assert lines[3] == "  motor layer: a tick every 3008 us, 332.4 Hz"
+    assert lines[4:] == [
         "  A  C 3    every 18022 us, written at 55.41 Hz  range 0.1..0.9, speed 4, accel 50",
         "  W  GP2/3  PWM of 20 kHz, written at 332.4 Hz   range -1..1, accel 20",
     ]
@@ -154,11 +168,15 @@ def test_check_of_files_that_are_none(run, tmp_path):
 def test_render_and_run_report_the_mistakes_of_all_files(run, tmp_path, bad):
     robot = tmp_path / "robot.toml"
     robot.write_text("[output.NECK]\npin = 0\n")
-    for command in (["render", "--seconds", "1", "--out", tmp_path / "o.csv"], ["run"]):
+    for command in (
+        ["render", "--seconds", "1", "--out", tmp_path / "o.csv"],
+        ["plot", "--seconds", "1", "--out", tmp_path / "o.png"],
+        ["run"],
+    ):
         status, _, err = run(command[0], bad, "--score", SCORE, "--robot", robot, "--mcu", "unix", *command[1:])
         assert status == 2
         assert "dof.NECK.rest" in err and 'unknown behaviour "CALM"' in err and "output.NECK.pin" in err
-    assert not (tmp_path / "o.csv").exists()
+    assert list(tmp_path.glob("o.*")) == []
 
 
 @pytest.mark.parametrize("seconds", ["0", "-1", "nan", "inf", "1e9", "ten", "1/0", "9" * 40, ""])
@@ -176,6 +194,39 @@ def test_render_that_cannot_be_written_fails_before_the_work(run, tmp_path, monk
     status, _, err = run("render", PET, "--score", SCORE, "--seconds", "1", "--mcu", "unix", "--out", out)
     assert status == 1
     assert f"{out}: cannot be written: no such file or directory" in err
+
+
+PLOT = ["plot", PET, "--score", SCORE, "--seconds", "1"]
+
+
+@pytest.mark.parametrize("out", ["o.pdf", "o", "png", ""])
+def test_plot_is_a_png_or_an_svg(run, out):
+    status, _, err = run(*PLOT, "--out", out)
+    assert status == 2
+    assert f"found {out!r}, expected a name that ends in .png or .svg" in err
+
+
+def test_plot_of_an_unknown_dof_is_the_users_mistake(run, tmp_path):
+    expected = f"marotte: {PET} has no DOF 'NEK'; did you mean \"NECK\"?\n"
+    assert run(*PLOT, "--dof", "HEAD_YAW", "NEK", "--out", tmp_path / "o.png") == (2, "", expected)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_plot_without_matplotlib_says_how_to_install_it(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    status, out, err = run(*PLOT, "--out", tmp_path / "o.png")
+    assert (status, out) == (2, "")
+    assert (
+        err == "marotte: plotting needs matplotlib, which is not installed; please run: pip install 'matplotlib>=3.8'\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_plot_that_cannot_be_written_fails_before_the_work(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("marotte.rendering.render", lambda *_, **__: pytest.fail("rendered for nothing"))
+    out = tmp_path / "absent" / "o.png"
+    expected = f"marotte: {out}: cannot be written: no such file or directory\n"
+    assert run(*PLOT, "--out", out) == (1, "", expected)
 
 
 @pytest.mark.parametrize("port", ["/dev/ttyNOSUCH7", "socket://127.0.0.1:1", "/dev/null", __file__])

@@ -36,3 +36,28 @@ def test_documents_name_files_that_exist():
         if not (ROOT / name).exists()
     ]
     assert not missing
+
+
+ROW_TEST = re.compile(r"`(tests/[\w/]+\.py)::(test_\w+)`")
+
+
+def fault_rows():
+    """The rows of the tables of `docs/faults.md`, as lists of cells."""
+    lines = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8").splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    return [row for row in rows if row[0] not in ("fault", "---")]
+
+
+def test_each_fault_has_a_test_that_exists():
+    missing = []
+    for fault, *_, test in fault_rows():
+        named = ROW_TEST.fullmatch(test)
+        text = (ROOT / named[1]).read_text(encoding="utf-8") if named and (ROOT / named[1]).exists() else ""
+        if not named or not re.search(rf"^def {named[2]}\(", text, re.MULTILINE):
+            missing.append(f"{fault}: {test}")
+    assert not missing
+
+
+def test_each_fault_says_what_host_or_puppet_do():
+    for fault, host, puppet, *_ in fault_rows():
+        assert host or puppet, fault

@@ -25,15 +25,23 @@ class FakeSession:
     def tempo(self, frame, action, tempo_q16):
         self.sent.append((frame, "tempo", action, tempo_q16))
 
+    def gains(self, frame, gains4_q16):
+        self.sent += [(frame, "gain", band, gain) for band, gain in gains4_q16.items()]
+
     def waiting(self, reached):
         return sum(frame > reached for frame, *_ in self.sent)
 
 
 def test_prompter_sends_everything_in_fixed_point():
     session = FakeSession()
-    prompter = Prompter(session, [Step(3, {0: 0.5, 7: 1e-12}, {1: 0.25}, 1.5, {6: 0.05})])
+    prompter = Prompter(
+        session, [Step(3, {0: 0.5, 7: 1e-12}, {1: 0.25}, 1.5, {6: 0.05}, (-4, -1.5, 0, 1, 1.00001, 2.5, 4))]
+    )
     prompter.reached(-1)
-    expected = [(3, "weight", 0, 1 << 27), (3, "weight", 7, 1), (3, "live", 1, 1 << 26)]
+    gains4_q16 = [0, 5 << 15, 4 << 16, 5 << 16, (5 << 16) + 1, 13 << 15, 8 << 16]
+    expected = [(3, "weight", 0, 1 << 27), (3, "weight", 7, 1)]
+    expected += [(3, "gain", band, gain) for band, gain in enumerate(gains4_q16)]
+    expected += [(3, "live", 1, 1 << 26)]
     expected += [(3, "tempo", 255, 98304), (3, "tempo", 6, 3277)]
     assert session.sent == expected
     assert prompter.is_done
@@ -60,7 +68,9 @@ def test_prompter_waits_for_room(size):
 
 @given(
     frames=st.lists(
-        st.tuples(st.integers(1, 5), st.integers(0, 8), st.integers(0, 4), st.booleans(), st.integers(0, 4)),
+        st.tuples(
+            st.integers(1, 5), st.integers(0, 4), st.integers(0, 4), st.booleans(), st.integers(0, 4), st.booleans()
+        ),
         max_size=30,
     ),
     strides=st.lists(st.integers(1, 4), min_size=1, max_size=10),
@@ -68,7 +78,7 @@ def test_prompter_waits_for_room(size):
 def test_prompter_sends_each_step_once_and_in_time(frames, strides):
     session = FakeSession()
     steps, frame = [], -1
-    for gap, weights, lives, has_tempo, tempos in frames:
+    for gap, weights, lives, has_tempo, tempos, has_gains in frames:
         frame += gap
         steps.append(
             Step(
@@ -77,6 +87,7 @@ def test_prompter_sends_each_step_once_and_in_time(frames, strides):
                 dict.fromkeys(range(lives), 0.5),
                 1.0 if has_tempo else None,
                 dict.fromkeys(range(tempos), 2.0),
+                (0.5,) * 7 if has_gains else None,
             )
         )
     prompter = Prompter(session, steps, QUEUE_MAX)

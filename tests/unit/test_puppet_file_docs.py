@@ -12,7 +12,6 @@ from marotte.expressions import TEXT_MAX
 from marotte.functions import Function, parse_function
 from marotte.puppet_file import read_puppet
 from marotte.score import read_score
-from marotte.supported import NOT_YET
 from marotte.tomlfile import Table
 from marotte.wiring import read_robot
 from shared import formats, program
@@ -56,7 +55,7 @@ AROUND = {
     ("The puppet", "dof"): "[dof.A]\n{}\n",
     ("The puppet", "limits"): "[dof.A]\nlimits = {{ {} }}\n",
     ("The puppet", "character"): "[dof.A]\ncharacter = {{ {} }}\n",
-    ("The puppet", "live"): "[dof.A]\n[live.L]\n{}\n",
+    ("The puppet", "live"): '[dof.A]\n[live.L]\npredict = "kalman"\n{}\n',
     ("The puppet", "action"): '[dof.A]\n[action.X]\n{}\nentry = "start"\nmap = [["A", 0, 1, "rsin"]]\n',
     ("The puppet", "mood"): "[dof.A]\n[mood.M]\n{}\n",
     ("The score", ""): "[[cue]]\n{}\n",
@@ -211,9 +210,3 @@ def test_documentation_names_the_capacities():
         f"2 to {formats.SAMPLES_MAX} samples",
     ):
         assert what in puppet, what
-
-
-def test_documentation_names_what_is_not_supported_yet():
-    section = chapters().get("Not yet", "")
-    assert all(feature in section for feature in NOT_YET)
-    assert bool(section) == bool(NOT_YET)

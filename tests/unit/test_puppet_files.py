@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marotte.functions import Function, FunctionError, parse_function
+from marotte.kalman import Kalman
 from marotte.positions import line_numbers
 from marotte.puppet import Character
 from marotte.puppet_file import load_puppet, read_puppet
-from marotte.supported import NOT_YET
 from marotte.tomlfile import FileMistakes, key_text
 from shared import formats, program
 
@@ -41,7 +41,7 @@ map = [ ["NECK", 0.5, 0.5, "const(0.25)"], ["WHEEL", 0, 0, "live(UNDECLARED)"] ]
 NOD = 4
 STILL = 0.05
 [mood.CALM]
-gains = [1, 1, 1, 1, 1, 1.0, 1]
+gains = [2.5, -4, 0, 4, 1, 1.0, 1]
 tempo = 0.25
 """
 
@@ -75,7 +75,7 @@ def test_puppet_reads_everything(tmp_path):
     assert puppet.lives["GAZE"].tau_s == (0.2, 0.3)
     assert (puppet.lives["UNDECLARED"].rest, puppet.lives["UNDECLARED"].tau_s) == (0.5, (0.1, 0.1))
     assert puppet.behaviours["HAPPY"] == {"NOD": 4.0, "STILL": 0.05}
-    assert (puppet.moods["CALM"].gains, puppet.moods["CALM"].tempo) == ((1.0,) * 7, 0.25)
+    assert (puppet.moods["CALM"].gains, puppet.moods["CALM"].tempo) == ((2.5, -4, 0, 4, 1, 1, 1), 0.25)
     assert (puppet.action_index("STILL"), puppet.live_index("UNDECLARED")) == (1, 1)
 
 
@@ -226,17 +226,55 @@ def test_puppet_mistake_is_named_and_placed(tmp_path, old, new, expected):
     assert any(expected in line for line in found), found
 
 
-NOT_YET_CASES = [
-    ("1, 1.0, 1]", "1, 1.5, 1]", "gains"),
-    ("tau = [0.2, 0.3]", 'predict = "kalman"', "kalman"),
-]
+BLINKING = """
+[dof.EYELID]
+signal = true
+[dof.LAMP]
+kind = "relative"
+[action.LOOK]
+map = [["LAMP", 0, 1, "rsin"]]
+[action.WINK]
+map = [["LAMP", 0, 1, "rtrigsin(0.9, 1)"], ["EYELID", 0, 1, "blink"]]
+[action.DOZE]
+map = [["EYELID", 0, 1, "blink"]]
+"""
 
 
-@pytest.mark.parametrize(("old", "new", "feature"), NOT_YET_CASES)
-def test_puppet_says_what_this_version_does_not_perform(tmp_path, old, new, feature):
-    assert old in GOOD
-    found = mistakes_of(tmp_path, GOOD.replace(old, new, 1))
-    assert [line.split(": ", 1)[1] for line in found] == [f"{NOT_YET[feature]} is not supported by this version"]
+def test_puppet_signal_of_a_dof_that_blinks_is_a_mistake_that_names_the_mapping(tmp_path):
+    text = ":3 dof.EYELID.signal: found true, expected false: action.WINK.map[1] makes it blink, and nobody knows when it will"
+    assert mistakes_of(tmp_path, BLINKING) == [text]
+    (found,) = mistakes_of(
+        tmp_path, BLINKING.replace("signal = true", "").replace('"relative"', '"relative"\nsignal = true')
+    )
+    assert "dof.LAMP.signal: found true, expected false: action.WINK.map[0] makes it blink" in found
+
+
+@pytest.mark.parametrize(
+    ("text", "signals"),
+    [
+        ("", [True, False]),
+        ("[dof.C]\nsignal = false\n", [True, False, False]),
+        ('[dof.C]\nkind = "relative"\nsignal = true\n', [True, False, True]),
+        ('[dof.C]\n[action.WINK]\nmap = [["A", 0, 1, "blink"], ["C", 0, 1, "noise1"]]\n', [False, False, True]),
+    ],
+)
+def test_puppet_signal_is_processed_where_it_is_absolute_and_never_blinks_unless_the_file_says(tmp_path, text, signals):
+    path = tmp_path / "p.toml"
+    path.write_text('[dof.A]\n[dof.B]\nkind = "relative"\n' + text)
+    assert [dof.signal for dof in load_puppet(path).dofs.values()] == signals
+
+
+def test_puppet_reads_how_live_channels_are_predicted(tmp_path):
+    path = tmp_path / "p.toml"
+    path.write_text('[dof.A]\n[live.X]\n[live.Y]\npredict = "kalman"\nagility = 9\nnoise = 0.02\nfade = 0.25\n')
+    plain, predicted = load_puppet(path).lives.values()
+    assert (plain.kalman, predicted.kalman) == (None, Kalman(0.02, 9.0, 0.25))
+
+
+@pytest.mark.parametrize("key", ["agility", "noise", "fade"])
+def test_puppet_parameters_of_a_prediction_that_there_is_not_are_a_mistake(tmp_path, key):
+    found = mistakes_of(tmp_path, f"[dof.A]\n[live.X]\n{key} = 0.1\n")
+    assert found == [f':3 live.X.{key}: only a channel with predict = "kalman" has {key}']
 
 
 MOTOR = """

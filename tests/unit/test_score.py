@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from marotte.puppet_file import load_puppet
 from marotte.score import Cue, Score, Step, load_score, read_score, resumed, state
-from marotte.supported import NOT_YET
 from marotte.tomlfile import FileMistakes
 
 PUPPETS = Path(__file__).parents[2] / "puppets"
@@ -32,6 +31,8 @@ C = 2
 tempo = 2
 [mood.PLAIN]
 gains = [1, 1, 1, 1, 1, 1, 1]
+[mood.NERVOUS]
+gains = [2.5, 2, 1.4, 1, -1, 0, -4]
 """
 
 
@@ -142,6 +143,28 @@ def test_score_mood_without_tempo_leaves_it(tmp_path, puppet):
     assert steps_of(tmp_path, puppet, '[[cue]]\nat=0\nmood="PLAIN"\n')[0].master_tempo is None
 
 
+ONES = (1.0,) * 7
+NERVOUS = (2.5, 2.0, 1.4, 1.0, -1.0, 0.0, -4.0)
+
+
+@pytest.mark.parametrize(
+    ("cues", "gains"),
+    [
+        ('[[cue]]\nat=0\nmood="NERVOUS"\n', NERVOUS),
+        ('[[cue]]\nat=0\nmood="FAST"\n', ONES),
+        ("[[cue]]\nat=0\ntempo={global=2}\n", None),
+        ('[[cue]]\nat=0\ngains=[0,0,0,0,0,0,0]\nmood="NERVOUS"\n', (0.0,) * 7),
+        ('[[cue]]\nat=0\ngains=[0,0,0,0,0,0,0]\n[[cue]]\nat=0\nmood="NERVOUS"\n', NERVOUS),
+        ('[[cue]]\nat=0\nmood="NERVOUS"\n[[cue]]\nat=0\nmood="FAST"\n', ONES),
+        ('[[cue]]\nat=0\nmood="NERVOUS"\n[[cue]]\nat=0\nweights={A=1}\n', NERVOUS),
+    ],
+)
+def test_score_gains_come_from_the_last_mood_or_gains_and_a_mood_without_them_sets_all_to_1(
+    tmp_path, puppet, cues, gains
+):
+    assert steps_of(tmp_path, puppet, cues)[0].gains == gains
+
+
 def test_score_steps_come_in_order_of_frames(tmp_path, puppet):
     steps = steps_of(tmp_path, puppet, "[[cue]]\nat=2\nweights={A=1}\n[[cue]]\nat=1\nweights={A=2}\n")
     assert list(steps) == [10, 20]
@@ -201,51 +224,51 @@ def test_score_reports_all_mistakes(tmp_path, puppet):
     assert len(mistakes_of(tmp_path, puppet, text)) == 5
 
 
-@pytest.mark.parametrize(("text", "feature"), [("gains=[2,1,1,1,1,1,1]", "gains")])
-def test_score_says_what_this_version_does_not_perform(tmp_path, puppet, text, feature):
-    expected = [f"{NOT_YET[feature]} is not supported by this version"]
-    found = mistakes_of(tmp_path, puppet, f"[[cue]]\nat=0\n{text}\n")
-    assert [line.split(": ", 1)[1] for line in found] == expected
-
-
 TIMES = st.integers(0, 40).map(lambda tenth: Fraction(tenth, 20))
 CUES = st.builds(
     Cue,
     TIMES,
     st.sampled_from([None, "AB", "ONLY_C"]),
     st.dictionaries(st.sampled_from("ABC"), st.sampled_from([0.0, 0.5, 4.0])),
-    st.sampled_from([None, "FAST", "PLAIN"]),
+    st.sampled_from([None, "FAST", "PLAIN", "NERVOUS"]),
+    st.sampled_from([None, (0.5,) * 7]),
 )
 
 
 @given(cues=st.lists(CUES, max_size=12))
-def test_score_steps_lead_to_the_targets_of_the_definition(tmp_path_factory, cues):
+def test_score_steps_lead_to_the_targets_and_gains_of_the_definition(tmp_path_factory, cues):
     path = tmp_path_factory.getbasetemp() / "steps.toml"
     path.write_text(PUPPET)
     puppet = load_puppet(path)
     names = list(puppet.actions)
     steps = {step.frame: step for step in Score(tuple(cues)).steps(puppet)}
     sent = dict.fromkeys(names, 0.0)
+    sent_gains = ONES
     for frame in range(25):
         if frame in steps:
             sent.update((names[index], target) for index, target in steps[frame].weights.items())
+            sent_gains = steps[frame].gains or sent_gains
         expected = dict.fromkeys(names, 0.0)
+        gains = ONES
         for cue in sorted(cues, key=lambda cue: cue.at_s):
             if cue.at_s * 10 <= frame:
                 if cue.behaviour:
                     expected = {name: puppet.behaviours[cue.behaviour].get(name, 0.0) for name in names}
                 expected.update(cue.weights)
-        assert sent == expected
+                if cue.mood:
+                    gains = puppet.moods[cue.mood].gains or ONES
+                gains = cue.gains or gains
+        assert (sent, sent_gains) == (expected, gains)
 
 
 def test_state_is_what_all_cues_until_then_have_set(puppet):
     steps = [
         Step(0, {0: 1.0}, {0: 0.25}, None),
-        Step(10, {0: 0.0, 1: 2.0}, {}, 1.5, {2: 3.0}),
+        Step(10, {0: 0.0, 1: 2.0}, {}, 1.5, {2: 3.0}, NERVOUS),
         Step(11, {2: 4.0}, {0: 1.0}, None),
     ]
-    assert state(steps, puppet, -1) == Step(-1, {0: 0.0, 1: 0.0, 2: 0.0}, {0: puppet.lives["GAZE"].rest}, 1.0)
-    assert state(steps, puppet, 10) == Step(10, {0: 0.0, 1: 2.0, 2: 0.0}, {0: 0.25}, 1.5, {2: 3.0})
+    assert state(steps, puppet, -1) == Step(-1, {0: 0.0, 1: 0.0, 2: 0.0}, {0: puppet.lives["GAZE"].rest}, 1.0, {}, ONES)
+    assert state(steps, puppet, 10) == Step(10, {0: 0.0, 1: 2.0, 2: 0.0}, {0: 0.25}, 1.5, {2: 3.0}, NERVOUS)
     now, *later = resumed(steps, puppet, 10)
     assert (now.frame, now.weights, later) == (-1, {0: 0.0, 1: 2.0, 2: 0.0}, steps[2:])
 

@@ -73,6 +73,9 @@ CONSTANTS = [
     ("blinks", "_RTRIGSIN", formats.FUNCTION_RTRIGSIN),
     ("actions", "_ENTRY_START", formats.ENTRY_START),
     ("exchange", "_NEW", formats.NEW),
+    ("rings", "_NEW", formats.NEW),
+    ("rings", "_DOFS", formats.DOFS_MAX),
+    ("rings", "_ZERO_Q16", 1 << 20),  # bands.ZERO_Q16
     ("trajectory", "_DOFS", formats.DOFS_MAX),
     ("trajectory", "_ONE", formats.POSITION_ONE),
     ("character", "_TERMS", len(messages.find(messages.CHARACTER)[2]) - 1),
@@ -81,6 +84,19 @@ CONSTANTS = [
     ("feedback", "_ONE", formats.POSITION_ONE),
     ("guards", "_HALF", formats.POSITION_ONE // 2),
     ("driver_bridge", "_STOP_Q24", formats.POSITION_ONE // 2),
+    *((module, "_RCOS", formats.FUNCTION_RCOS) for module in ("foresight", "foresight_thumb")),
+    *((module, "_NOISE", formats.FUNCTION_NOISE) for module in ("foresight", "foresight_thumb")),
+    ("foresight", "_CONST", formats.FUNCTION_CONST),
+    *((module, "_LIVE", formats.FUNCTION_LIVE) for module in ("foresight", "foresight_thumb")),
+    *((module, "_CURVE", formats.FUNCTION_CURVE) for module in ("foresight", "foresight_thumb")),
+    *((module, "_PROGRAM", formats.FUNCTION_PROGRAM) for module in ("foresight", "foresight_thumb", "budget")),
+    *((module, "_DOFS", formats.DOFS_MAX) for module in ("bands", "bands_thumb", "signal_processing")),
+    *((module, "_ZERO", 1 << 20) for module in ("bands", "bands_thumb")),  # bands.ZERO_Q16
+    *((module, "_DELTA_ZERO", 1 << 16) for module in ("bands", "bands_thumb")),
+    ("signal_processing", "_ZERO", 1 << 28),  # its ZERO_Q20
+    ("outlook", "_ONE_Q28", formats.WEIGHT_ONE),
+    ("kalman", "_LIVES", formats.LIVES_MAX),
+    ("kalman", "_ONE", formats.WEIGHT_ONE),
     ("motor", "_DOFS", formats.DOFS_MAX),
     ("motor", "_STILL_Q24", formats.POSITION_ONE // 2),
     ("motor", "_CALM_PER_S", 1000 // formats.STAND_MS),
@@ -108,6 +124,18 @@ def test_constant_repeated_in_the_firmware_is_the_shared_one(module, name, expec
 
 LITERALS = [
     ("weights", "integrate", formats.SNAP_Q28),
+    ("weights", "foresee", formats.SNAP_Q28),
+    ("weights", "sketch", formats.ALPHA_ONE),
+    ("outlook", "_advance_phases", formats.CYCLES - 1),
+    ("outlook", "_advance_phases", (1 << formats.PHASE_BITS) - 1),
+    ("outlook", "_sketch_phases", formats.CYCLES - 1),
+    ("outlook", "_sketch_phases", (1 << formats.PHASE_BITS) - 1),
+    ("foresight", "_evaluate", formats.VALUE_ONE),
+    ("foresight", "_evaluate", (1 << formats.PHASE_BITS) - 1),
+    ("foresight", "_divide", formats.FAINT_Q28),
+    ("foresight_thumb", "evaluate", formats.VALUE_ONE),
+    ("bands", "bend", formats.VALUE_ONE),
+    ("signal_processing", "_finish", formats.VALUE_ONE),
     ("compositor", "hold_targets", formats.FAINT_Q28),
     ("compositor", "hold_targets", formats.WEIGHT_ONE),
     ("actions", "_phases", formats.CYCLES - 1),
@@ -145,8 +173,8 @@ def test_every_kernel_is_called_by_a_test_in_checked_integers():
     found = 0
     missing = []
     for path in (*SOURCES["firmware"], *SOURCES["shared"]):
-        if path.name == "board_rp2040.py":
-            continue  # these write registers: the emulated chip's pins show what they do
+        if path.name == "board_rp2040.py" or path.stem.endswith("_thumb"):
+            continue  # these write registers, or call the chip's own instructions: the emulated chip shows what they do
         functions = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.FunctionDef)]
         loading = "\n".join(test for test in tests if f'"{path.parent.name}/{path.name}"' in test)
         for kernel in (node for node in functions if "micropython.viper" in map(ast.unparse, node.decorator_list)):

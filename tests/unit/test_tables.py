@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marotte.character import response
+from marotte.kalman import Kalman, kalman_fields
 from marotte.limits import LimitsInUse
 from marotte.link import PAYLOAD_SENT_MAX, pack
 from marotte.puppet import Character, Dof
@@ -91,6 +92,13 @@ def test_tables_begin_announces_what_follows(tmp_path):
     ]
 
 
+def test_tables_live_channels_say_how_they_are_predicted(tmp_path):
+    (tmp_path / "p.toml").write_text(PUPPET.replace("rest = 1", 'predict = "kalman"\nagility = 5'))
+    (gaze, _), (late, _) = messages_named(build_tables(load_puppet(tmp_path / "p.toml")), "live")
+    assert gaze.items() >= {"predict": formats.PREDICT_KALMAN, **kalman_fields(Kalman(agility=5), 40)}.items()
+    assert late.items() >= {"predict": formats.PREDICT_HOLD, "process_q16": 0, "noise_q16": 0, "fade_q15": 0}.items()
+
+
 def test_tables_dofs_are_in_unit_values(tmp_path):
     assert [fields for fields, _ in messages_named(tables_of(tmp_path), "dof")] == [
         {
@@ -101,6 +109,7 @@ def test_tables_dofs_are_in_unit_values(tmp_path):
             "high_q15": 28672,
             "speed_q24": floor(10 * 0.02 * 2**24),  # the defaults, at 50 Hz
             "accel_q24": floor(200 * 0.02**2 * 2**24) - 1,
+            "signal": 1,
         },
         {
             "dof": 1,
@@ -110,6 +119,7 @@ def test_tables_dofs_are_in_unit_values(tmp_path):
             "high_q15": 32768,
             "speed_q24": 1 << 24,
             "accel_q24": floor(20 * 0.02 * 2**23),
+            "signal": 0,
         },
     ]
 
@@ -137,6 +147,7 @@ def test_tables_tempos_and_filters(tmp_path):
     assert action["fall_q26"] == round((1 - math.exp(-1 / (40 * 2))) * 2**26)
     (gaze, _), (late, _) = messages_named(tables, "live")
     assert (gaze["rest_q28"], late["rest_q28"]) == (1 << 28, 1 << 27)
+    assert (gaze["predict"], gaze["noise_q16"]) == (formats.PREDICT_HOLD, 0)
     assert late["rise_q26"] == late["fall_q26"] == gaze["rise_q26"] > gaze["fall_q26"]
 
 

@@ -70,6 +70,16 @@ def test_view_shows_dofs_weights_pulses_and_time(view):
     assert len(text.splitlines()) <= 24
 
 
+def test_view_shows_mood_gains_and_clipping_where_there_is_something_to_say(view):
+    plain = picture(view, Scene(45))
+    assert not any(word in plain for word in ("mood", "gains", "clipped"))
+    assert "\nmood EVEN ─" in picture(view, Scene(45, mood="EVEN"))
+    text = picture(view, Scene(45, mood="NERVOUS", gains=(2.5, 2.0, 1.4, 1.0, 1.0, -0.5, 0.0), clipped=12))
+    assert "\nmood NERVOUS, gains 2.5 2 1.4 1 1 -0.5 0 ─" in text
+    assert "12 values clipped" in text
+    assert len(text.splitlines()) == len(plain.splitlines())
+
+
 def test_view_shows_the_beginning_and_silence(view):
     assert "no word from the MCU" in picture(view, Scene(is_silent=True))
 

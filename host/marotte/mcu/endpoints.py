@@ -6,11 +6,20 @@ import contextlib
 import os
 import select
 import socket
+import time
 from abc import ABC, abstractmethod
 
 from marotte.errors import MarotteError
 
 READ_BYTES = 4096
+MUTE_S = 5.0
+"""A client that has sent nothing for so long gives way to another one: it may have gone without a word, as behind a tunnel."""
+
+TOLD_S = 0.3
+"""A client that is refused is told after this: pyserial forgets what has come before it had opened the port."""
+
+REFUSED_MAX = 8
+"""Clients that were refused and are kept until they have read it."""
 
 
 class Endpoint(ABC):
@@ -41,7 +50,7 @@ class Endpoint(ABC):
 
 
 class TcpEndpoint(Endpoint):
-    """A TCP port of this machine (127.0.0.1). A second client is told that the port is in use, and let go.
+    """A TCP port of this machine (127.0.0.1). A second client is told that it is in use, and let go, unless the first is mute.
 
     Raises MarotteError if the port (0: any) is taken or not allowed.
     """
@@ -58,6 +67,8 @@ class TcpEndpoint(Endpoint):
         self._listener.setblocking(False)
         self._client: socket.socket | None = None
         self._client_name = ""
+        self._heard_s = 0.0
+        self._refused: list[tuple[socket.socket, float]] = []  # and when they are told, 0 if they have been
         self.url = f"socket://127.0.0.1:{self._listener.getsockname()[1]}"
 
     def waitable(self) -> list:
@@ -68,6 +79,7 @@ class TcpEndpoint(Endpoint):
 
     def read(self) -> bytes:
         data = self._read_client()
+        self._tell_refused()
         with contextlib.suppress(BlockingIOError):
             self._accept()
         return data
@@ -81,22 +93,35 @@ class TcpEndpoint(Endpoint):
             return b""
         except OSError:
             data = b""
-        if not data:
+        if data:
+            self._heard_s = time.monotonic()
+        else:
             self._drop_client()
         return data
 
     def _accept(self) -> None:
         client, address = self._listener.accept()
-        if self._client:
-            refusal = f"marotte: this emulated MCU is in use by {self._client_name}; one client at a time\r\n"
-            with contextlib.suppress(OSError):
-                client.sendall(refusal.encode())
-            client.close()
+        if self._client and time.monotonic() - self._heard_s < MUTE_S:
+            self._refused.append((client, time.monotonic() + TOLD_S))
             return
+        self._drop_client()
+        self._heard_s = time.monotonic()
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._client = client
         self._client_name = f"{address[0]}:{address[1]}"
+
+    def _tell_refused(self) -> None:
+        """Tell clients that the port is in use. They are closed later: what they have sent meanwhile would cut it short."""
+        refusal = f"marotte: this emulated MCU is in use by {self._client_name}; one client at a time\r\n"
+        for place, (client, told_s) in enumerate(self._refused):
+            if told_s and time.monotonic() >= told_s:
+                self._refused[place] = (client, 0.0)
+                with contextlib.suppress(OSError):
+                    client.sendall(refusal.encode())
+                    client.shutdown(socket.SHUT_WR)
+        while len(self._refused) > REFUSED_MAX:
+            self._refused.pop(0)[0].close()
 
     def write(self, data: bytes) -> int:
         if not self._client:
@@ -116,6 +141,9 @@ class TcpEndpoint(Endpoint):
 
     def close(self) -> None:
         self._drop_client()
+        for client, _ in self._refused:
+            client.close()
+        self._refused.clear()
         self._listener.close()
 
 
