@@ -96,13 +96,12 @@ def _respond(
 class Character:
     """The dynamics of all DOFs. `output_q24` (with 16 added) is where each of them is led."""
 
-    def __init__(self):
+    def __init__(self, tables):
         self.output_q24 = words(DOFS_MAX)
         self._before_q24 = words(DOFS_MAX)
         self._rate_q24 = words(DOFS_MAX)
         self._operand = words(3)
-        self._used = bytearray(DOFS_MAX)
-        self._coefficient_q24 = words(_TERMS * DOFS_MAX)
+        self._tables = tables
 
     def stand(self, dof, position_q24):
         """Let a DOF stand at a place."""
@@ -116,21 +115,15 @@ class Character:
         gather_words(self._rate_q24, keep, scratch, dofs, _ZERO, 0)
 
     def load(self, tables):
-        """Take over which DOFs have a character, and its coefficients; a tick may come in between. Allocates."""
-        used = bytearray(tables.has_character)
-        coefficient_q24 = words(_TERMS * DOFS_MAX)
-        for dof in range(tables.dofs):
-            if used[dof]:
-                for place in range(_TERMS * dof, _TERMS * (dof + 1)):
-                    coefficient_q24[place] = tables.response_q24[place] + _ZERO
-        self._coefficient_q24 = coefficient_q24
-        self._used = used
+        """Take over which DOFs have a character, and its coefficients; a tick may come at any time."""
+        self._tables = tables
 
     def respond(self, dofs, input_q24):
         """Take the step of one tick towards the input, which is Q24 with 16 added."""
+        tables = self._tables
         # fmt: off
         _respond(
-            input_q24, self.output_q24, self._before_q24, self._rate_q24, dofs, self._used, self._coefficient_q24,
-            self._operand,
+            input_q24, self.output_q24, self._before_q24, self._rate_q24, dofs, tables.has_character,
+            tables.response_q24, self._operand,
         )
         # fmt: on

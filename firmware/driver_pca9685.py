@@ -91,6 +91,13 @@ def prescale(clock_khz, period_us):
     return (clock_khz * period_us + 2048000) // 4096000 - 1
 
 
+def _scale_q21(clock_khz, divider):
+    """Return how many counts a microsecond has. In two steps, as what has more than 30 bits would need memory."""
+    clock_q14 = clock_khz << 14
+    steps = 1000 * (divider + 1)
+    return (clock_q14 // steps << 7) + (clock_q14 % steps << 7) // steps
+
+
 class _Chip:
     """One PCA9685."""
 
@@ -135,7 +142,7 @@ class _Chip:
             wanted = prescale(settings[5], period_us)
             same = same and wanted == self._divider[1]
             self._divider[1] = wanted
-            self._scale_q21 = (settings[5] << 21) // (1000 * (wanted + 1))
+            self._scale_q21 = _scale_q21(settings[5], wanted)
         self.written = self.attached
         if not same or not period_us:
             self.attached = self.written = 0

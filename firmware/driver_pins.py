@@ -24,6 +24,8 @@ class PinsDriver(Driver):
         self._attached = 0  # bits of DOFs
         self._pin = bytearray([NO_PIN] * DOFS_MAX)
         self._period_us = halves(DOFS_MAX)
+        self._pin_before = bytearray(DOFS_MAX)
+        self._period_before_us = halves(DOFS_MAX)
 
     def pwm(self, settings, place):
         """Return the numbers of the settings that are PWM pins."""
@@ -36,22 +38,26 @@ class PinsDriver(Driver):
     def load(self, tables):
         """Keep the pulses of pins that have the same period in the new tables; all others fall silent."""
         pins = self._pin
-        pulsing = []  # pin and period
+        before = self._pin_before
+        period_before_us = self._period_before_us
+        pulsing = self._attached
         for dof in range(DOFS_MAX):
-            if self._attached >> dof & 1:
-                pulsing.append((pins[dof], self._period_us[dof]))
+            before[dof] = pins[dof]
+            period_before_us[dof] = self._period_us[dof]
             pins[dof] = NO_PIN
         kept = 0
         for dof in range(tables.dofs):
-            if tables.driver[dof] == DRIVER_PINS:
-                pins[dof] = tables.settings[dof * SETTINGS_MAX]
-                self._period_us[dof] = self.period_us(tables, dof)
-                output = (pins[dof], self._period_us[dof])
-                if output in pulsing:
-                    pulsing.remove(output)
+            if tables.driver[dof] != DRIVER_PINS:
+                continue
+            pin = pins[dof] = tables.settings[dof * SETTINGS_MAX]
+            period_us = self._period_us[dof] = self.period_us(tables, dof)
+            for was in range(DOFS_MAX):
+                if pulsing >> was & 1 and before[was] == pin and period_before_us[was] == period_us:
+                    pulsing &= ~(1 << was)
                     kept |= 1 << dof
-        for pin, _ in pulsing:
-            self._board.pin_low(pin)
+        for was in range(DOFS_MAX):
+            if pulsing >> was & 1:
+                self._board.pin_low(before[was])
         self._attached = kept
         return kept
 

@@ -119,18 +119,22 @@ class Drivers:
                     return True
         return False
 
-    def load(self, tables):
+    def writing(self, tables):
+        """Return the drivers that write in the tick and have outputs in `tables`."""
+        used = set(tables.driver[dof] for dof in range(tables.dofs))
+        return tuple(driver for code, driver in enumerate(self._drivers) if driver.in_tick and code in used)
+
+    def load(self, tables, writing):
         """Play other tables: outputs that are gone fall silent. Returns the DOFs whose output goes on as it was, as bits.
 
-        To be called with the tick kept away.
+        `writing` is what `writing` has said of them. To be called with the tick kept away; allocates nothing.
         """
         kept = 0
         for driver in self._drivers:
             kept |= driver.load(tables)
         for dof in range(DOFS_MAX):
             self._driver[dof] = tables.driver[dof] if dof < tables.dofs else NO_DRIVER
-        used = set(self._driver)
-        self._writing = tuple(driver for code, driver in enumerate(self._drivers) if driver.in_tick and code in used)
+        self._writing = writing
         return kept
 
     def attach(self, dof, until_us):

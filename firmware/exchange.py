@@ -75,7 +75,7 @@ class Exchange:
         self._of_actions = (
             a.target_q28, a.x_q28, a.w_q28, a.before_q28, a.start_q18, a.fraction_q24, a.tempo_q16, a.wanted_tempo_q16
         )  # fmt: skip
-        self._drawn = None  # seed and spread of the gradients that play
+        self._seed = self._spread_q15 = -1  # of the gradients that play
         self._gradients = halves(NOISE_TABLES * GRADIENTS)  # those of the staged tables
         self._old_mapping = halves(MAPPINGS_MAX)
         self._scratch = words(MAPPINGS_MAX)
@@ -90,12 +90,14 @@ class Exchange:
         staged = puppet.staged
         step = self.step
         if step < NOISE_TABLES:
-            if (staged.seed, staged.spread_q15) != self._drawn:
+            if not self._are_drawn(staged):
                 functions.fill_gradients(self._gradients, step + 1, staged.seed, staged.spread_q15)
         elif step - NOISE_TABLES < staged.actions:
             action = step - NOISE_TABLES
             staged.link_repeats(action)
             self._find_blinks(action)
+        elif step - NOISE_TABLES == staged.actions and puppet.frame >= 0:
+            puppet.motor.prepare(staged)
         else:
             return True
         self.step += 1
@@ -116,10 +118,10 @@ class Exchange:
         micropython.heap_lock()  # what allocates nothing is twice as fast then
         try:
             self._carry_synthesis(puppet.tables, puppet.staged)
+            puppet.motor.exchange(puppet.staged, gather_words, gather_halves, self._scratch)
+            self._swap()
         finally:
             micropython.heap_unlock()
-        puppet.motor.exchange(puppet.staged, gather_words, gather_halves, self._scratch)
-        self._swap()
 
     def _carry_synthesis(self, old, new):
         puppet = self._puppet
@@ -158,12 +160,16 @@ class Exchange:
         puppet = self._puppet
         puppet.tables, puppet.staged = puppet.staged, puppet.tables
         puppet.staged.ready = False
-        noise = (puppet.tables.seed, puppet.tables.spread_q15)
-        if noise != self._drawn:
+        if not self._are_drawn(puppet.tables):
             puppet.gradients, self._gradients = self._gradients, puppet.gradients
-            self._drawn = noise
+            self._seed = puppet.tables.seed
+            self._spread_q15 = puppet.tables.spread_q15
         puppet.blinks.exchange(puppet.tables, self._old_mapping, self._scratch)
         self.step = -1
+
+    def _are_drawn(self, tables):
+        """Return whether the gradients that play are those of these tables."""
+        return tables.seed == self._seed and tables.spread_q15 == self._spread_q15
 
     def _find_blinks(self, action):
         """Seed the streams of an action's blinks, and note which old mapping each of them continues."""

@@ -105,7 +105,7 @@ class Motor:
         self.guards = Guards(self, board)
         self._board = board
         self._drivers = drivers
-        self._character = Character()
+        self._character = Character(tables)
         self._correction_q24 = words(DOFS_MAX)
         self._before_q24 = words(2 * DOFS_MAX)
         self._force_q24 = words(DOFS_MAX)
@@ -138,10 +138,13 @@ class Motor:
         self._since = 0  # ticks at which the turns began
         self._seen = 0
         self._seen_us = board.ticks_us()
+        self._writing = ()  # the next tables' drivers, and so on, once they are prepared
+        self._next_tag = 0
+        self._has_same_dofs = True
         self.tick = self._tick  # bound once: binding allocates
         self._set_rates(tables)
-        self._course = self._steps(tables)
-        next(self._course)
+        self.prepare(tables)
+        self._course = self._next_course
         board.start_ticks(MOTOR_PERIOD_MAX_US, self.tick)
 
     # --- the main loop's side
@@ -193,8 +196,9 @@ class Motor:
             self._take_ends(d)
             self._stand(d)
         self._hold_unattached()
-        self._drivers.load(tables)
         self._set_rates(tables)
+        self.prepare(tables)
+        self._drivers.load(tables, self._writing)
         self.trajectory.load(tables)
         self.trajectory.hold(tables.dofs, self.position_q24)
         self._take_over(tables)
@@ -203,15 +207,24 @@ class Motor:
         self._times_us[2] = _UNKNOWN_US
         board.start_ticks(tables.motor_period_us, self.tick)
 
+    def prepare(self, tables):
+        """Make what an exchange for other tables needs, which are complete; allocates."""
+        self._next_tag = _tag(tables)
+        self._has_same_dofs = _same_dofs(tables, self.tables)
+        self._writing = self._drivers.writing(tables)
+        course = self._steps(tables)
+        next(course)
+        self._next_course = course
+
     def exchange(self, tables, gather_words, gather_halves, scratch):
-        """Take over other tables while the motion goes on; `tables.keep_dof` says which DOF was which.
+        """Take over the prepared tables while the motion goes on; `tables.keep_dof` says which DOF was which.
 
         Outputs that are no longer used fall silent, new ones are attached one after the other. Frame rate and motor period
         are the same. `gather_*(values, old, scratch, count, fresh, at)` rearrange an array. If the DOFs and their outputs
-        stay as they were, no tick waits for this; else ticks that come meanwhile, some 10 ms, are made up for by the next.
+        stay as they were, no tick waits for this; else ticks that come meanwhile are made up for by the next. Allocates nothing.
         """
         before = self.tables
-        if _same_dofs(tables, before):
+        if self._has_same_dofs:
             self.tables = tables
             self._take_over(tables)
             self._unsettled = True
@@ -223,17 +236,10 @@ class Motor:
         self._take_over(tables)
         self._unsettled = True
         self._paused = False
-        self._board.kept_pose(0, self.position_q24, _tag(tables))  # from now on it is kept under the new tag
+        self._board.kept_pose(0, self.position_q24, self._next_tag)  # from now on it is kept under the new tag
 
     def _rearrange(self, before, tables, gather_words, gather_halves, scratch):
-        going_on = self._drivers.load(tables)
-        micropython.heap_lock()  # what follows is twice as fast then
-        try:
-            self._gather(before, tables, going_on, gather_words, gather_halves, scratch)
-        finally:
-            micropython.heap_unlock()
-
-    def _gather(self, before, tables, going_on, gather_words, gather_halves, scratch):
+        going_on = self._drivers.load(tables, self._writing)
         keep = tables.keep_dof
         dofs = tables.dofs
         attached = 0
@@ -534,9 +540,7 @@ class Motor:
         self._kill_level = tables.kill_level
         self._kill_pin = tables.kill_pin
         self._timeout_ticks = tables.link_timeout_ms * 1000 // tables.motor_period_us
-        course = self._steps(tables)
-        next(course)
-        self._course = course
+        self._course = self._next_course
 
     def _set_rates(self, tables):
         period_us = tables.motor_period_us

@@ -34,8 +34,9 @@ from shared.formats import (
 
 _COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
 _PORTION_US = const(4000)  # of work, behind which the main loop has its turn
-_CARRY_US = const(21000)  # what putting other tables into force takes
-_MARGIN_US = const(6000)  # between the end of a frame and what is done then
+_CARRY_US = const(12000)  # what putting other tables into force takes
+_MARGIN_US = const(3000)  # between the end of a frame and what is done then
+_LESS_US = const(500)  # that will do when it has been waited a frame longer
 
 
 class Puppet:
@@ -93,6 +94,7 @@ class Puppet:
         self.exchange = Exchange(self)
         self._exchange_due = False
         self._exchange_due_in = -1  # the frame before which it is, once that has been prepared for
+        self._waiting_since = -1  # the frame since which time is wanted for an exchange
         self._tempos_changed = 0
         self._is_starting = False
         self._rehearsed = 0
@@ -137,6 +139,7 @@ class Puppet:
         self.cues.clear()
         if self.exchange.step >= 0:
             self._exchange_due = False
+            self._waiting_since = -1
             self.commit()
 
     def prepare(self):
@@ -161,6 +164,7 @@ class Puppet:
         if self._exchange_due:
             if self._exchange_due_in == self.frame:
                 self._exchange_due = False
+                self._waiting_since = -1
                 self.exchange.carry_over()
                 self._tempos_changed = 1
             elif self._has_time(_CARRY_US):
@@ -169,10 +173,13 @@ class Puppet:
             else:
                 return False
         elif self.exchange.prepare():
+            if self._waiting_since < 0:
+                self._waiting_since = self.frame
             if not self._has_time(_COLLECT_US):
                 return False
             gc.collect()
             self._exchange_due = True
+            self._waiting_since = self.frame
         return True
 
     def _expect(self):
@@ -208,8 +215,12 @@ class Puppet:
             now_us = self._board.ticks_us()
 
     def _has_time(self, need_us):
-        """Return whether so much time is left until the next frame, or as much as there is behind any."""
+        """Return whether so much time is left until the next frame, or as much as there is behind any.
+
+        That is not known, as the line wants some of it, too: the longer it is waited for, the less will do.
+        """
         most_us = 1000000 // self.clock.rate_hz - self.frame_max_us - _MARGIN_US
+        most_us -= _LESS_US * (self.frame - self._waiting_since)
         return self.clock.until_us(self._board.ticks_us()) >= min(need_us, most_us)
 
     def step(self):

@@ -73,6 +73,7 @@ _PULSE_MAX_Q4US = PULSE_MAX_US << PULSE_BITS
 _ACCEL_MIN_Q24 = 2
 _UNIT_TO_POSITION = POSITION_BITS - VALUE_BITS
 _RESPONSES = 6  # coefficients of a character
+_RESPONSE_ZERO = 1 << 28  # what is added to them: 16
 
 
 @micropython.viper
@@ -162,7 +163,7 @@ class Tables:
         self.speed_q24 = words(DOFS_MAX)
         self.accel_q24 = words(DOFS_MAX)
         self.has_character = bytearray(DOFS_MAX)
-        self.response_q24 = words(DOFS_MAX * _RESPONSES)
+        self.response_q24 = words(DOFS_MAX * _RESPONSES)  # with 16 added, as words have no sign
         # per DOF: its output
         self.driver = bytearray(DOFS_MAX)
         self.turns = bytearray(DOFS_MAX)
@@ -399,7 +400,7 @@ class Tables:
         for number, response_q24 in enumerate(responses):
             if not -RESPONSE_MAX_Q24 <= response_q24 <= RESPONSE_MAX_Q24:
                 return 1 + number
-            self.response_q24[dof * _RESPONSES + number] = response_q24
+            self.response_q24[dof * _RESPONSES + number] = response_q24 + _RESPONSE_ZERO
         self.has_character[dof] = 1
         return None
 

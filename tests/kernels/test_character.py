@@ -3,6 +3,7 @@
 import itertools
 import math
 import random
+from types import SimpleNamespace
 
 import numpy
 import pytest
@@ -50,13 +51,20 @@ def coefficients(f_hz, zeta, r, period_us):
     return [round(row[n] * ONE) for n in range(2) for row in rows]
 
 
+def tables_of(responses):
+    """What tables say of the characters of some DOFs."""
+    tables = SimpleNamespace(has_character=bytearray(16), response_q24=words([0] * 96))
+    for dof, numbers in responses.items():
+        tables.has_character[dof] = 1
+        tables.response_q24[6 * dof : 6 * dof + 6] = words([number + ZERO for number in numbers])
+    return tables
+
+
 class Moved:
     """One DOF with a character, at rest at first; values are 0..1 and floats."""
 
     def __init__(self, f_hz, zeta, r, period_us, start):
-        self._kernel = MODULE.Character()
-        self._kernel._used[0] = 1
-        self._kernel._coefficient_q24[:6] = words([c + ZERO for c in coefficients(f_hz, zeta, r, period_us)])
+        self._kernel = MODULE.Character(tables_of({0: coefficients(f_hz, zeta, r, period_us)}))
         self._kernel.stand(0, round(start * ONE))
         self._input = words([0])
 
@@ -196,9 +204,7 @@ def test_character_with_a_negative_response_goes_the_other_way_first():
 
 def test_dofs_without_a_character_are_left_as_they_are():
     rng = random.Random(5)
-    kernel = MODULE.Character()
-    kernel._used[1] = 1
-    kernel._coefficient_q24[6:12] = words([c + ZERO for c in coefficients(3, 0.5, 1, 20_000)])
+    kernel = MODULE.Character(tables_of({1: coefficients(3, 0.5, 1, 20_000)}))
     alone = Moved(3, 0.5, 1, 20_000, 0.5)
     for dof in range(3):
         kernel.stand(dof, ONE // 2)

@@ -123,7 +123,7 @@ def check_motor_tables(tables):
         assert tables.turns[dof] >= 1
         assert tables.driver[dof] == 255 or tables.turns[dof] * tables.motor_period_us < 21000
         assert 0 <= tables.dead_q15[dof] < tables.top_q15[dof] <= 32768
-        assert all(abs(number) <= 1 << 28 for number in tables.response_q24[6 * dof : 6 * dof + 6])
+        assert all(0 <= number <= 1 << 29 for number in tables.response_q24[6 * dof : 6 * dof + 6])
         if tables.driver[dof] in (formats.DRIVER_PINS, formats.DRIVER_PCA9685):
             assert all(300 * 16 <= end[dof] <= 3000 * 16 for end in (tables.end0_q4us, tables.end1_q4us))
         if tables.feedback_pin[dof] != formats.NO_PIN:

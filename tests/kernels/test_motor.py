@@ -111,7 +111,10 @@ class Drivers:
     def __init__(self):
         self.pulsing = 0
 
-    def load(self, tables):
+    def writing(self, tables):
+        return ()
+
+    def load(self, tables, writing):
         return self.pulsing
 
     def attach(self, dof, until_us):

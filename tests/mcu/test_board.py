@@ -77,8 +77,10 @@ def tick():
 def play(outputs, devices=(), period=20000):
     global period_us
     period_us = period
+    tables = tables_of(outputs, devices, period)
+    writing = drivers.writing(tables)
     state = board.lock()
-    drivers.load(tables_of(outputs, devices, period))
+    drivers.load(tables, writing)
     board.unlock(state)
     board.start_ticks(period, tick)
 
