@@ -35,8 +35,11 @@ class Driver:
         """Return the period of an output's pulses: that of its turn among the motor ticks, if nothing else is said."""
         return tables.turns[dof] * tables.motor_period_us
 
+    def prepare(self, tables):
+        """Allocate what `load` needs."""
+
     def load(self, tables):
-        """Serve other tables. Outputs that are gone fall silent; return the DOFs whose output goes on as it was, as bits."""
+        """Serve other tables, allocating nothing. Outputs that are gone fall silent; return the DOFs whose output goes on as it was, as bits."""
         return 0
 
     def attach(self, dof, until_us):

@@ -122,7 +122,21 @@ class _Chip:
         self._dof = bytearray([_NO_DOF] * _CHANNELS)
         self._dof_before = bytearray([_NO_DOF] * _CHANNELS)
         self._registers = bytearray(1 + 4 * _CHANNELS)
-        self._burst = memoryview(self._registers)
+        self._burst = self._next_burst = memoryview(self._registers)
+        self._next_first = 0
+
+    def prepare(self, tables, device):
+        """Note which of the registers are to be sent for a device's channels in these tables."""
+        first = _CHANNELS
+        last = -1
+        for dof in range(tables.dofs):
+            at = dof * SETTINGS_MAX
+            if tables.driver[dof] == DRIVER_PCA9685 and tables.settings[at] == device:
+                channel = tables.settings[at + 1]
+                first = min(first, channel)
+                last = max(last, channel)
+        self._next_first = first
+        self._next_burst = memoryview(self._registers)[4 * first : 5 + 4 * last]
 
     def load(self, tables, device):
         """Take over a device and its channels; return the DOFs whose channel goes on, as bits."""
@@ -160,15 +174,10 @@ class _Chip:
             self._dof[channel] = _NO_DOF
         attached_before = self.attached
         self.attached = self.mask = period_us = 0
-        first = _CHANNELS
-        last = 0
         for dof in range(tables.dofs):
             at = dof * SETTINGS_MAX
             if tables.driver[dof] == DRIVER_PCA9685 and tables.settings[at] == device:
-                channel = tables.settings[at + 1]
-                first = min(first, channel)
-                last = max(last, channel)
-                self._dof[channel] = dof
+                self._dof[tables.settings[at + 1]] = dof
                 self.mask |= 1 << dof
                 period_us = tables.turns[dof] * tables.motor_period_us
         registers = self._registers
@@ -182,8 +191,8 @@ class _Chip:
                 registers[at + 3] = _FULL_OFF
         if period_us:
             # Nothing is sent of the channels before the first; the last byte of theirs takes the burst's register address.
-            registers[4 * first] = _FIRST_REGISTER + 4 * first
-            self._burst = memoryview(registers)[4 * first : 5 + 4 * last]
+            registers[4 * self._next_first] = _FIRST_REGISTER + 4 * self._next_first
+            self._burst = self._next_burst
         return period_us
 
     def attach(self, dof):
@@ -335,6 +344,11 @@ class Pca9685Driver(Driver):
             return True
         return sda == its_sda and scl == its_scl and baud_khz == its_baud_khz and address != its_address
 
+    def prepare(self, tables):
+        """Note what is to be sent to each chip."""
+        for device in range(DEVICES_MAX):
+            self._chips[device].prepare(tables, device)
+
     def load(self, tables):
         """Keep the pulses of channels that stay, on chips that stay as they are."""
         kept = 0
@@ -354,7 +368,9 @@ class Pca9685Driver(Driver):
                     self._board.drive(old_oe, 1)
                 if chip.oe != NO_PIN:
                     self._board.drive(chip.oe, 1)
+        lock = self._board.lock()  # a kill in the midst of it would be undone
         self._switch()
+        self._board.unlock(lock)
         return kept
 
     def attach(self, dof, until_us):

@@ -23,7 +23,7 @@ class Drivers:
     def __init__(self, board):
         self._board = board
         self._drivers = [kind(board) for kind in _KINDS]
-        self._writing = tuple(self._drivers)  # those that write in the tick and have outputs
+        self._writing = self._next_writing = ()  # those that write in the tick and have outputs
         self._later = [driver for driver in self._drivers if not driver.in_tick]
         self._driver = bytearray([NO_DRIVER] * DOFS_MAX)
 
@@ -119,22 +119,24 @@ class Drivers:
                     return True
         return False
 
-    def writing(self, tables):
-        """Return the drivers that write in the tick and have outputs in `tables`."""
+    def prepare(self, tables):
+        """Allocate what `load` needs for these tables."""
         used = set(tables.driver[dof] for dof in range(tables.dofs))
-        return tuple(driver for code, driver in enumerate(self._drivers) if driver.in_tick and code in used)
+        self._next_writing = tuple(driver for code, driver in enumerate(self._drivers) if driver.in_tick and code in used)
+        for driver in self._drivers:
+            driver.prepare(tables)
 
-    def load(self, tables, writing):
-        """Play other tables: outputs that are gone fall silent. Returns the DOFs whose output goes on as it was, as bits.
+    def load(self, tables):
+        """Play the prepared tables: outputs that are gone fall silent. Returns the DOFs whose output goes on as it was, as bits.
 
-        `writing` is what `writing` has said of them. To be called with the tick kept away; allocates nothing.
+        To be called with the tick kept away; allocates nothing.
         """
         kept = 0
         for driver in self._drivers:
             kept |= driver.load(tables)
         for dof in range(DOFS_MAX):
             self._driver[dof] = tables.driver[dof] if dof < tables.dofs else NO_DRIVER
-        self._writing = writing
+        self._writing = self._next_writing
         return kept
 
     def attach(self, dof, until_us):

@@ -138,8 +138,7 @@ class Motor:
         self._since = 0  # ticks at which the turns began
         self._seen = 0
         self._seen_us = board.ticks_us()
-        self._writing = ()  # the next tables' drivers, and so on, once they are prepared
-        self._next_tag = 0
+        self._next_tag = 0  # of the tables that are prepared
         self._has_same_dofs = True
         self.tick = self._tick  # bound once: binding allocates
         self._set_rates(tables)
@@ -198,7 +197,7 @@ class Motor:
         self._hold_unattached()
         self._set_rates(tables)
         self.prepare(tables)
-        self._drivers.load(tables, self._writing)
+        self._drivers.load(tables)
         self.trajectory.load(tables)
         self.trajectory.hold(tables.dofs, self.position_q24)
         self._take_over(tables)
@@ -211,7 +210,7 @@ class Motor:
         """Make what an exchange for other tables needs, which are complete; allocates."""
         self._next_tag = _tag(tables)
         self._has_same_dofs = _same_dofs(tables, self.tables)
-        self._writing = self._drivers.writing(tables)
+        self._drivers.prepare(tables)
         course = self._steps(tables)
         next(course)
         self._next_course = course
@@ -239,7 +238,7 @@ class Motor:
         self._board.kept_pose(0, self.position_q24, self._next_tag)  # from now on it is kept under the new tag
 
     def _rearrange(self, before, tables, gather_words, gather_halves, scratch):
-        going_on = self._drivers.load(tables, self._writing)
+        going_on = self._drivers.load(tables)
         keep = tables.keep_dof
         dofs = tables.dofs
         attached = 0

@@ -200,7 +200,8 @@ class Outputs:
 
     def load(self, *outputs, **others):
         self.tables = tables_of(outputs, **others)
-        return self.drivers.load(self.tables, self.drivers.writing(self.tables))
+        self.drivers.prepare(self.tables)
+        return self.drivers.load(self.tables)
 
     def attach(self, *dofs, until_us=0):
         for dof in dofs:

@@ -111,10 +111,10 @@ class Drivers:
     def __init__(self):
         self.pulsing = 0
 
-    def writing(self, tables):
-        return ()
+    def prepare(self, tables):
+        pass
 
-    def load(self, tables, writing):
+    def load(self, tables):
         return self.pulsing
 
     def attach(self, dof, until_us):

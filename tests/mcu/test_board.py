@@ -78,9 +78,9 @@ def play(outputs, devices=(), period=20000):
     global period_us
     period_us = period
     tables = tables_of(outputs, devices, period)
-    writing = drivers.writing(tables)
+    drivers.prepare(tables)
     state = board.lock()
-    drivers.load(tables, writing)
+    drivers.load(tables)
     board.unlock(state)
     board.start_ticks(period, tick)
 
