@@ -368,9 +368,7 @@ class Pca9685Driver(Driver):
                     self._board.drive(old_oe, 1)
                 if chip.oe != NO_PIN:
                     self._board.drive(chip.oe, 1)
-        lock = self._board.lock()  # a kill in the midst of it would be undone
         self._switch()
-        self._board.unlock(lock)
         return kept
 
     def attach(self, dof, until_us):
@@ -435,12 +433,11 @@ class Pca9685Driver(Driver):
         """Switch on the outputs of chips that have been written since they were off."""
         for device in range(DEVICES_MAX):
             if self._chips[device].written and not self._enabled[device]:
-                lock = self._board.lock()
                 self._switch()
-                self._board.unlock(lock)
 
     def _switch(self):
         """Drive every OE to what it should be: low if one of its chips has pulses and all of them have been written."""
+        lock = self._board.lock()  # a kill in the midst of it would be undone
         for device in range(DEVICES_MAX):
             oe = self._chips[device].oe
             if oe != NO_PIN:
@@ -448,6 +445,7 @@ class Pca9685Driver(Driver):
                 if wanted != self._enabled[device]:
                     self._enabled[device] = wanted
                     self._board.drive(oe, 1 - wanted)
+        self._board.unlock(lock)
 
     def _wanted(self, oe):
         written = 0
