@@ -118,6 +118,7 @@ class Exchange:
         micropython.heap_lock()  # what allocates nothing is twice as fast then
         try:
             self._carry_synthesis(puppet.tables, puppet.staged)
+            puppet.look()
             puppet.motor.exchange(puppet.staged, gather_words, gather_halves, self._scratch)
             self._swap()
         finally:

@@ -19,14 +19,15 @@ from micropython import const
 
 from firmware.clock import ticks_diff
 from firmware.commands import Commands
+from firmware.inbox import Inbox
 from firmware.store import Store
 from firmware.telemetry import Telemetry
 from shared import codec, messages
 from shared.formats import ACTIONS_MAX, DOFS_MAX, KILLED_BY_HOST, LIVES_MAX, MAPPINGS_MAX, QUEUE_MAX
 
-_CHUNK = const(32)  # bytes taken between two looks at the frame clock; one costs up to 50 us on USB
+_CHUNK = const(32)  # bytes taken between two looks at the frame clock
 _TOO_LONG = const(1000)  # more than any packet has, where the length of what never ends stays
-_STALE_US = const(20000)  # a partial packet older than this is dropped
+_CALL_US = const(20000)  # a pause behind `0D 03` that calls for the REPL
 _HISTORY = const(16)  # answers kept for repeated commands; the host has fewer under way
 _GREETINGS = const(8)  # a greeting with one of the last so many numbers ..
 _GREETING_US = const(150000)  # .. within this time is one that was repeated or overtaken
@@ -58,17 +59,13 @@ def _collect(chunk: ptr8, start: int, end: int, wire: ptr8, length: int, room: i
 class Link:
     """Receives and answers for one puppet.
 
-    `packets` and `damaged` count what came, `is_behind` tells that more may have come than `poll` has taken,
-    `has_heard` that it has taken anything since that was set to False. `commands`,
-    `telemetry` and `store` are its parts. A packet to send is put into `out`, two bytes of head first, and sent by `send`.
+    `packets` and `damaged` count what came. `inbox`, `commands`, `telemetry` and `store` are its parts. A packet to send is put into `out`, two bytes of head first, and sent by `send`.
     """
 
     def __init__(self, board, puppet):
         self.packets = 0
         self.damaged = 0
-        self.is_behind = False
-        self.has_heard = False
-        self._has_paused = False
+        self.inbox = Inbox(board, self._kill)
         self.out = bytearray(codec.BODY_MAX)
         self.telemetry = Telemetry(board, puppet, self)
         self.store = Store()
@@ -88,34 +85,22 @@ class Link:
         self._statuses = bytearray(_HISTORY)
         self._details = [0] * _HISTORY
         self._seals = bytearray(2 * _HISTORY)  # half of the checksum of each
-        self._byte_us = board.ticks_us()
 
     def poll(self):
         """Take what has arrived, at most `_CHUNK` bytes. Returns whether the REPL is called for."""
-        board = self._board
-        now_us = board.ticks_us()
+        inbox = self.inbox
         wire = self._wire
         chunk = self._chunk
         if self._length == 2 and wire[0] == codec.HANDOVER_FIRST and wire[1] == codec.HANDOVER_SECOND:
             # One byte at a time now, so that what follows is left for the REPL.
-            end = board.receive(self._single)
+            end = inbox.receive_next(self._single)
             if end == 0:
-                return ticks_diff(now_us, self._byte_us) > _STALE_US
+                return ticks_diff(self._board.ticks_us(), inbox.byte_us) > _CALL_US
             chunk[0] = self._single[0]
             if chunk[0] == codec.HANDOVER_FIRST or chunk[0] == codec.HANDOVER_SECOND:
                 return True
         else:
-            end = board.receive(chunk)
-        self.is_behind = end == len(chunk)
-        if end == 0:
-            self._has_paused = True
-            return False
-        self.has_heard = True
-        # Only where the line was seen to be still: the main loop itself may have been away for longer.
-        if self._length and self._has_paused and ticks_diff(now_us, self._byte_us) > _STALE_US:
-            self._length = 0
-            self._drop()
-        self._has_paused = False
+            end = inbox.receive(chunk)
         start = 0
         while start < end:
             stop = _collect(chunk, start, end, wire, self._length, codec.WIRE_MAX)
@@ -128,7 +113,6 @@ class Link:
                 self._length = 0
                 if length:  # a second zero ends nothing
                     self._packet(length)
-        self._byte_us = board.ticks_us()  # after the packets, of which a `commit` may take long
         return False
 
     def report(self):
@@ -144,6 +128,11 @@ class Link:
         length = codec.seal(out, length)
         self._board.send(self._out_wire, codec.encode(out, length, self._out_wire), is_telemetry)
 
+    def _kill(self, seq):
+        """Carry a kill out now, whatever is missing before it, or has come but not had its turn; in its turn that is done again."""
+        self._puppet.motor.kill(KILLED_BY_HOST)
+        self._kills = 0 < (seq - self._expected) & 255 < 128
+
     def _packet(self, length):
         body = self._wire
         if length > codec.WIRE_MAX:
@@ -158,9 +147,8 @@ class Link:
         self._puppet.motor.heard()
         message_id = body[0]
         seq = body[1]
-        if message_id == messages.KILL:  # now, whatever is missing before it; in its turn it is carried out again
-            self._puppet.motor.kill(KILLED_BY_HOST)
-            self._kills = 0 < (seq - self._expected) & 255 < 128
+        if message_id == messages.KILL:
+            self._kill(seq)
         if message_id == messages.HELLO and not self._is_old_greeting(seq):
             self._expected = self._greeting = seq
             self._greeted_us = self._board.ticks_us()

@@ -15,9 +15,7 @@ from firmware.puppet import Puppet
 from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
-_CHUNKS = 5  # of bytes that are taken in one pass: all that a host has under way, and a kill
-_BUSY_MAX = 2  # passes in a row that take what has come, before there is work between frames again
-_OVERDUE_US = 20000  # a frame that is so late waits for what has come, as a kill may be among it
+_CHUNKS = 5  # of bytes that are taken in one pass
 _WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board
 
 
@@ -26,7 +24,7 @@ def _take(board, puppet, link):
     for _ in range(_CHUNKS):
         if link.poll():
             return False
-        if not link.is_behind or (puppet.frame >= 0 and -_OVERDUE_US < puppet.clock.until_us(board.ticks_us()) <= 0):
+        if link.inbox.count == 0 or (puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0):
             break
     return True
 
@@ -39,16 +37,14 @@ def _pass(board, puppet, link):
     MicroPython then keeps the locals of larger functions on the stack, instead of looking through the heap for room, which costs
     200 us a call once it is half full.
     """
-    link.has_heard = False
     if not _take(board, puppet, link):
         return None
     if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0:
         puppet.step()
+        link.inbox.look()
         link.report()
-        if not _take(board, puppet, link):  # a kill does not wait for the work that follows
-            return None
     puppet.motor.attend()
-    longest_us = min(_IDLE_US, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
+    longest_us = min(1 if link.inbox.count else _IDLE_US, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
     if puppet.frame >= 0:
         longest_us = min(longest_us, puppet.clock.until_us(board.ticks_us()))
     return longest_us
@@ -73,14 +69,11 @@ def perform(board, room=None):
         if puppet.frame >= 0:
             puppet.start()  # again, as reading and collecting have taken their time
         board.watchdog(_WATCHDOG_MS)
-        longest_us = busy = 0
+        puppet.look = link.inbox.look
+        longest_us = 0
         while longest_us is not None:
-            if link.has_heard and busy < _BUSY_MAX:
-                busy += 1  # more may have come meanwhile, and a kill may be among it
-            elif longest_us > 0:
-                busy = 0
-                if not puppet.prepare():
-                    board.wait(longest_us)
+            if longest_us > 0 and not puppet.prepare():
+                board.wait(longest_us)
             micropython.heap_lock()
             try:
                 longest_us = _pass(board, puppet, link)

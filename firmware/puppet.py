@@ -39,18 +39,23 @@ _MARGIN_US = const(3000)  # between the end of a frame and what is done then
 _LESS_US = const(500)  # that will do when it has been waited a frame longer
 
 
+def _nothing():
+    """Look for nothing: there is no link."""
+
+
 class Puppet:
     """One puppet on one board.
 
     `frame` is the number of the next frame, -1 while the motion does not run. `base_q15` and `signal_q15` hold the last
     frame's values per DOF, after the compositor and after signal processing; `motor.motor_q15` what the motors were
     told. `entered` is how many actions have entered in the last frame. `clipped` counts the values that signal processing has
-    clipped at the ends of their range since `start`.
+    clipped at the ends of their range since `start`. `look` is what whatever takes long calls now and then, for a kill may come.
     """
 
     def __init__(self, board):
         self._sine = functions.sine_table()
         self.future = Future(self._sine)  # first, while the heap has room for its rings
+        self.look = _nothing
         self.frame = -1
         self.frame_max_us = 0
         self.clipped = 0
@@ -212,6 +217,7 @@ class Puppet:
                 return True
             if not future.work(self.tables, self):
                 return True
+            self.look()
             now_us = self._board.ticks_us()
 
     def _has_time(self, need_us):
