@@ -91,16 +91,17 @@ class Inbox:
         return self._state[0] == 2 and packet[0] == codec.HANDOVER_FIRST and packet[1] == codec.HANDOVER_SECOND
 
     def look(self):
-        """Take what has come, as far as there is room; act on a kill. Never waits, allocates nothing."""
+        """Take what has come, as far as there is room; act on a kill; return how many bytes wait. Allocates nothing."""
         chunk = self._chunk
         while self.count <= _ROOM - _CHUNK - 1 and not self.is_call():
             count = self._board.receive(chunk)
             if count == 0:
                 self._was_still = True
-                return
+                break
             self._put(chunk, count)
             if count < _CHUNK:
-                return
+                break
+        return self.count
 
     def receive(self, buffer):
         """Look, and move what has waited longest to `buffer`, at most its length; return the number of bytes."""

@@ -40,7 +40,8 @@ _LESS_US = const(500)  # that will do when it has been waited a frame longer
 
 
 def _nothing():
-    """Look for nothing: there is no link."""
+    """Look for nothing, as there is no link; nothing waits."""
+    return 0
 
 
 class Puppet:
@@ -49,7 +50,7 @@ class Puppet:
     `frame` is the number of the next frame, -1 while the motion does not run. `base_q15` and `signal_q15` hold the last
     frame's values per DOF, after the compositor and after signal processing; `motor.motor_q15` what the motors were
     told. `entered` is how many actions have entered in the last frame. `clipped` counts the values that signal processing has
-    clipped at the ends of their range since `start`. `look` is what whatever takes long calls now and then, for a kill may come.
+    clipped at the ends of their range since `start`. `look` is what whatever takes long calls now and then, for a kill may come; it returns how much waits.
     """
 
     def __init__(self, board):
@@ -217,7 +218,8 @@ class Puppet:
                 return True
             if not future.work(self.tables, self):
                 return True
-            self.look()
+            if self.look():
+                return True
             now_us = self._board.ticks_us()
 
     def _has_time(self, need_us):
