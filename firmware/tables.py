@@ -77,20 +77,29 @@ _RESPONSE_ZERO = 1 << 28  # what is added to them: 16
 
 
 @micropython.viper
-def _clear_words(values: ptr32, count: int):
-    """Set words to 0."""
+def _fill_words(values: ptr32, count: int, value: int):
+    """Set words to a value."""
     i = 0
     while i < count:
-        values[i] = 0
+        values[i] = value
         i += 1
 
 
 @micropython.viper
-def _clear_halves(values: ptr16, count: int):
-    """Set 16-bit words to 0."""
+def _fill_halves(values: ptr16, count: int, value: int):
+    """Set 16-bit words to a value."""
     i = 0
     while i < count:
-        values[i] = 0
+        values[i] = value
+        i += 1
+
+
+@micropython.viper
+def _fill_bytes(values: ptr8, count: int, value: int):
+    """Set bytes to a value."""
+    i = 0
+    while i < count:
+        values[i] = value
         i += 1
 
 
@@ -100,14 +109,14 @@ def words(count):
     It is made from a range, not from bytes: those would be as large as it is, and leave a hole in the heap.
     """
     values = array("i", range(count))
-    _clear_words(values, count)
+    _fill_words(values, count, 0)
     return values
 
 
 def halves(count):
     """Return an array of `count` unsigned 16-bit words, all 0."""
     values = array("H", range(count))
-    _clear_halves(values, count)
+    _fill_halves(values, count, 0)
     return values
 
 
@@ -254,8 +263,7 @@ class Tables:
         self.lives = lives
         self.seed = seed
         self.spread_q15 = spread_q15
-        for dof in range(DOFS_MAX):
-            self.hold_q26[dof] = hold_q26
+        _fill_words(self.hold_q26, DOFS_MAX, hold_q26)
         self.link_timeout_ms = link_timeout_ms
         self.when_silent = when_silent
         self.curves = curves
@@ -268,29 +276,24 @@ class Tables:
     def _forget_seen(self):
         self._dofs_seen = self._actions_seen = self._mappings_seen = self._lives_seen = 0
         self._curves_seen = self._programs_seen = self._blinks_seen = 0
-        for keep in (self.keep_action, self.keep_dof, self.keep_live):
-            for place in range(len(keep)):
-                keep[place] = NEW
+        _fill_bytes(self.keep_action, ACTIONS_MAX, NEW)
+        _fill_bytes(self.keep_dof, DOFS_MAX, NEW)
+        _fill_bytes(self.keep_live, LIVES_MAX, NEW)
         self._samples_used = self._samples_end = self._words_used = self._words_end = 0
         self._robot_seen = False
         self._stand_accel_q24 = _stand_accel_q24(MOTOR_PERIOD_MAX_US)
         self._guarded = 0  # bit per DOF
-        for device in range(DEVICES_MAX):
-            self.device_driver[device] = NO_DRIVER
-        for dof in range(DOFS_MAX):
-            self._bare(dof)
-
-    def _bare(self, dof):
-        """Take away what a DOF may have: character, output, feedback, guard."""
-        self.has_character[dof] = 0
-        self.driver[dof] = NO_DRIVER
-        self.turns[dof] = 1
-        self.top_q15[dof] = VALUE_ONE
-        self.dead_q15[dof] = 0
-        self.feedback_pin[dof] = NO_PIN
-        self.release_ms[dof] = 0
-        self.duty_q15[dof] = VALUE_ONE
-        self.window_s[dof] = 0
+        _fill_bytes(self.device_driver, DEVICES_MAX, NO_DRIVER)
+        # what a DOF may have: character, output, feedback, guard
+        _fill_bytes(self.has_character, DOFS_MAX, 0)
+        _fill_bytes(self.driver, DOFS_MAX, NO_DRIVER)
+        _fill_bytes(self.turns, DOFS_MAX, 1)
+        _fill_halves(self.top_q15, DOFS_MAX, VALUE_ONE)
+        _fill_halves(self.dead_q15, DOFS_MAX, 0)
+        _fill_bytes(self.feedback_pin, DOFS_MAX, NO_PIN)
+        _fill_halves(self.release_ms, DOFS_MAX, 0)
+        _fill_halves(self.duty_q15, DOFS_MAX, VALUE_ONE)
+        _fill_halves(self.window_s, DOFS_MAX, 0)
 
     def robot(self, motor_period_us, attach_ms, kill_pin, kill_level, autostart):
         """Store what all outputs share: the motor layer's period, the pace of attaching, the pin that kills."""

@@ -366,9 +366,11 @@ def test_curves_and_programs_fill_their_pools_and_no_more():
     assert (tables.program(programs, 2), tables.word(0)) == (1, 0)
 
 
-def test_arrays_begin_with_zeros_and_no_more_is_cleared():
-    words, halves = array("i", [-1] * 5), array("H", [65535] * 5)
-    MODULE._clear_words(words, 4)
-    MODULE._clear_halves(halves, 4)
-    assert (list(words), list(halves)) == ([0, 0, 0, 0, -1], [0, 0, 0, 0, 65535])
+def test_arrays_begin_with_zeros_and_no_more_is_filled():
+    words, halves, octets = array("i", [-1] * 5), array("H", [65535] * 5), bytearray([255] * 5)
+    MODULE._fill_words(words, 4, 1 << 29)
+    MODULE._fill_halves(halves, 4, 0)
+    MODULE._fill_bytes(octets, 4, 7)
+    assert (list(words), list(halves)) == ([1 << 29] * 4 + [-1], [0, 0, 0, 0, 65535])
+    assert list(octets) == [7, 7, 7, 7, 255]
     assert (MODULE.words(300), MODULE.halves(300)) == (array("i", [0] * 300), array("H", [0] * 300))
