@@ -425,9 +425,11 @@ class Board:
                 break
         if count:
             self._to_uart = False
-        elif self._uart.any():
-            count = self._uart.readinto(buffer) or 0
-            self._to_uart = True
+        else:
+            ready = self._uart.any()
+            if ready:  # no more than that, as it would wait for a millisecond whether another byte follows
+                count = self._uart.readinto(buffer, min(ready, room)) or 0
+                self._to_uart = True
         return count
 
     def send(self, buffer, length, is_telemetry=False):

@@ -5,10 +5,6 @@ good as lost; one that comes after a gap is answered with the number that is exp
 answer. `hello` begins a session with whatever number it has; one that was repeated or overtaken on its way begins nothing.
 What commands mean is in `commands`, what the MCU tells by itself in `telemetry`.
 
-The REPL is called for by `0D 03` where a packet would begin and then a pause, another `0D`, or another `03`, as
-mpremote and others do it. `0D 03` alone would not do: a single flipped bit can make a packet begin with it, and would
-end the performance.
-
 Nothing here allocates while a puppet plays.
 """
 
@@ -25,9 +21,6 @@ from firmware.telemetry import Telemetry
 from shared import codec, messages
 from shared.formats import ACTIONS_MAX, DOFS_MAX, KILLED_BY_HOST, LIVES_MAX, MAPPINGS_MAX, QUEUE_MAX
 
-_CHUNK = const(32)  # bytes taken between two looks at the frame clock
-_TOO_LONG = const(1000)  # more than any packet has, where the length of what never ends stays
-_CALL_US = const(20000)  # a pause behind `0D 03` that calls for the REPL
 _HISTORY = const(16)  # answers kept for repeated commands; the host has fewer under way
 _GREETINGS = const(8)  # a greeting with one of the last so many numbers ..
 _GREETING_US = const(150000)  # .. within this time is one that was repeated or overtaken
@@ -37,23 +30,6 @@ _COUNT_MAX = const(0x3FFFFFFF)  # where counts stay, as a larger one would need 
 _WELCOME_FIELDS = messages.find(messages.WELCOME)[2]
 _WELCOME_FORMAT = messages.struct_format(_WELCOME_FIELDS)
 _WELCOME_END = _PAYLOAD + messages.size(_WELCOME_FIELDS)
-
-
-@micropython.viper
-def _collect(chunk: ptr8, start: int, end: int, wire: ptr8, length: int, room: int) -> int:
-    """Append `chunk[start:end]` to `wire` up to a zero byte; return the place of that zero, or `end`.
-
-    What does not fit in `room` is left out; the caller counts by places, so it knows that the packet was too long.
-    """
-    while start < end:
-        byte = int(chunk[start])
-        if byte == 0:
-            return start
-        if length < room:
-            wire[length] = byte
-        length += 1
-        start += 1
-    return end
 
 
 class Link:
@@ -72,10 +48,7 @@ class Link:
         self.commands = Commands(puppet, self.telemetry, self.store)
         self._board = board
         self._puppet = puppet
-        self._chunk = bytearray(_CHUNK)
-        self._single = bytearray(1)
         self._wire = bytearray(codec.WIRE_MAX)
-        self._length = 0
         self._out_wire = bytearray(codec.WIRE_MAX)
         self._out_seq = 0
         self._expected = -1  # no session yet
@@ -87,33 +60,15 @@ class Link:
         self._seals = bytearray(2 * _HISTORY)  # half of the checksum of each
 
     def poll(self):
-        """Take what has arrived, at most `_CHUNK` bytes. Returns whether the REPL is called for."""
+        """Take what has come, carry out one packet at most; return how many bytes wait, -1 if the REPL is called for."""
         inbox = self.inbox
-        wire = self._wire
-        chunk = self._chunk
-        if self._length == 2 and wire[0] == codec.HANDOVER_FIRST and wire[1] == codec.HANDOVER_SECOND:
-            # One byte at a time now, so that what follows is left for the REPL.
-            end = inbox.receive_next(self._single)
-            if end == 0:
-                return ticks_diff(self._board.ticks_us(), inbox.byte_us) > _CALL_US
-            chunk[0] = self._single[0]
-            if chunk[0] == codec.HANDOVER_FIRST or chunk[0] == codec.HANDOVER_SECOND:
-                return True
-        else:
-            end = inbox.receive(chunk)
-        start = 0
-        while start < end:
-            stop = _collect(chunk, start, end, wire, self._length, codec.WIRE_MAX)
-            self._length += stop - start
-            if self._length > _TOO_LONG:
-                self._length = _TOO_LONG
-            start = stop + 1
-            if stop < end:
-                length = self._length
-                self._length = 0
-                if length:  # a second zero ends nothing
-                    self._packet(length)
-        return False
+        if inbox.is_calling():
+            return -1
+        inbox.look()
+        length = inbox.next(self._wire)
+        if length:
+            self._packet(length)
+        return inbox.waiting()
 
     def report(self):
         """Send the telemetry that is due after a frame."""

@@ -15,18 +15,17 @@ from firmware.puppet import Puppet
 from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
-_CHUNKS = 5  # of bytes that are taken in one pass
+_PACKETS = 4  # that are carried out in one pass, at most
 _WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board
 
 
 def _take(board, puppet, link):
-    """Take what has come, all that a host has under way if no frame is due; return whether to go on, not to the REPL."""
-    for _ in range(_CHUNKS):
-        if link.poll():
-            return False
-        if link.inbox.count == 0 or (puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0):
+    """Carry out what has come, until a frame is due; return how many bytes wait, -1 if the REPL is called for."""
+    for _ in range(_PACKETS):
+        waiting = link.poll()
+        if waiting <= 0 or (puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0):
             break
-    return True
+    return waiting
 
 
 def _pass(board, puppet, link):
@@ -37,14 +36,15 @@ def _pass(board, puppet, link):
     MicroPython then keeps the locals of larger functions on the stack, instead of looking through the heap for room, which costs
     200 us a call once it is half full.
     """
-    if not _take(board, puppet, link):
+    waiting = _take(board, puppet, link)
+    if waiting < 0:
         return None
     if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0:
         puppet.step()
         link.inbox.look()
         link.report()
     puppet.motor.attend()
-    longest_us = min(1 if link.inbox.count else _IDLE_US, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
+    longest_us = min(1 if waiting else _IDLE_US, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
     if puppet.frame >= 0:
         longest_us = min(longest_us, puppet.clock.until_us(board.ticks_us()))
     return longest_us
