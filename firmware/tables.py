@@ -237,25 +237,31 @@ class Tables:
         # fmt: on
         """Empty the set and announce what will come."""
         self.ready = False
-        for number, (value, least, most) in enumerate(
-            (
-                (frame_rate_hz, FRAME_RATE_MIN_HZ, FRAME_RATE_MAX_HZ),
-                (dofs, 1, DOFS_MAX),
-                (actions, 0, ACTIONS_MAX),
-                (mappings, 0, MAPPINGS_MAX),
-                (lives, 0, LIVES_MAX),
-                (curves, 0, CURVES_MAX),
-                (programs, 0, isa.PROGRAMS_MAX),
-                (blinks, 0, BLINKS_MAX),
-                (seed, 0, 0xFFFFFFFF),
-                (spread_q15, 0, VALUE_ONE),
-                (hold_q26, 1, ALPHA_ONE - 1),
-                (link_timeout_ms, 100, 60000),
-                (when_silent, 0, SILENT_RELAX),
-            )
-        ):
-            if not least <= value <= most:
-                return number
+        # One by one: tuples of limits would be allocated, which takes long where the heap is nearly full.
+        if not FRAME_RATE_MIN_HZ <= frame_rate_hz <= FRAME_RATE_MAX_HZ:
+            return 0
+        if not 1 <= dofs <= DOFS_MAX:
+            return 1
+        if actions > ACTIONS_MAX:
+            return 2
+        if mappings > MAPPINGS_MAX:
+            return 3
+        if lives > LIVES_MAX:
+            return 4
+        if curves > CURVES_MAX:
+            return 5
+        if programs > isa.PROGRAMS_MAX:
+            return 6
+        if blinks > BLINKS_MAX:
+            return 7
+        if spread_q15 > VALUE_ONE:
+            return 9
+        if not 1 <= hold_q26 < ALPHA_ONE:
+            return 10
+        if not 100 <= link_timeout_ms <= 60000:
+            return 11
+        if when_silent > SILENT_RELAX:
+            return 12
         self.frame_rate_hz = frame_rate_hz
         self.dofs = dofs
         self.actions = actions
