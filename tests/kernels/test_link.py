@@ -1,4 +1,4 @@
-"""The link's kernels: packets gathered from chunks, telemetry packed, and the packet codec."""
+"""The link's kernels: telemetry packed, and the packet codec."""
 
 import struct
 import zlib
@@ -12,25 +12,9 @@ from shared import formats
 from tests.checked import load_checked
 from tests.kernels.values import halves, integers, weights_q28, words
 
-LINK = load_checked("firmware/link.py")
 TELEMETRY = load_checked("firmware/telemetry.py")
 CODEC = load_checked("shared/codec.py")
 BODY_MAX, WIRE_MAX = CODEC.BODY_MAX, CODEC.WIRE_MAX
-
-chunks = st.lists(st.sampled_from([0, 1, 255]) | st.integers(0, 255), min_size=1, max_size=32).map(bytes)
-
-
-@given(chunks, st.integers(0, 31), st.integers(0, WIRE_MAX + 40), st.integers(0, 32))
-def test_collecting_appends_up_to_the_zero_and_never_beyond_the_room(chunk, start, length, room):
-    start = min(start, len(chunk) - 1)
-    wire = bytearray(b"\xa5" * room)
-    stop = LINK._collect(chunk, start, len(chunk), wire, length, room)
-    run = chunk[start:].partition(b"\0")[0]
-    assert stop == start + len(run)
-    kept = run[: max(0, room - length)]
-    expected = bytearray(b"\xa5" * room)
-    expected[length : length + len(kept)] = kept
-    assert wire == expected
 
 
 @given(st.integers(0, 8), st.integers(0, 3), st.lists(integers(0, 65535, 32768), max_size=48), st.integers(0, 2))
