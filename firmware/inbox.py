@@ -111,18 +111,15 @@ class Inbox:
         self._byte_us = board.ticks_us()  # when the last byte was taken
 
     def look(self):
-        """Take what has come, as far as there is room; act on a kill; return how many bytes wait. Allocates nothing."""
+        """Take a chunk of what has come, if there is room; act on a kill; return how many bytes wait. Allocates nothing."""
         state = self._state
-        chunk = self._chunk
         # What follows a call for the REPL may be meant for that.
-        while state[_COUNT] < _FULL and not (state[_LENGTH] == 2 and self._is_call()):
-            count = self._board.receive(chunk)
-            if count == 0:
+        if state[_COUNT] <= _FULL and not (state[_LENGTH] == 2 and self._is_call()):
+            count = self._board.receive(self._chunk)
+            if count:
+                self._put(self._chunk, count)
+            else:
                 self._was_still = True
-                break
-            self._put(chunk, count)
-            if count < _CHUNK:
-                break
         return state[_COUNT]
 
     def next(self, wire):
