@@ -16,11 +16,17 @@ from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
 _PACKETS = 4  # that are carried out in one pass, at most
+_LATE_US = 1500  # by which a frame may wait for what has come
 _WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board
 
 
 def _take(board, puppet, link):
-    """Carry out what has come, until a frame is due; return how many bytes wait, -1 if the REPL is called for."""
+    """Carry out what has come, until a frame is due; return how many bytes wait, -1 if the REPL is called for.
+
+    If a frame is late already, it comes first; only a kill does not wait for it.
+    """
+    if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) < -_LATE_US:
+        return link.inbox.look()
     for _ in range(_PACKETS):
         waiting = link.poll()
         if waiting <= 0 or (puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0):

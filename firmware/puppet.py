@@ -34,6 +34,7 @@ from shared.formats import (
 
 _COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
 _PORTION_US = const(4000)  # of work, behind which the main loop has its turn
+_OVERRUN_US = const(1500)  # by which a step may hold a frame up
 _CARRY_US = const(12000)  # what putting other tables into force takes
 _MARGIN_US = const(3000)  # between the end of a frame and what is done then
 _LESS_US = const(500)  # that will do when it has been waited a frame longer
@@ -212,7 +213,7 @@ class Puppet:
         begun_us = now_us = self._board.ticks_us()
         while True:
             need_us = future.need_us()
-            if self.clock.until_us(now_us) < need_us >> 1:
+            if self.clock.until_us(now_us) < need_us - _OVERRUN_US:
                 return now_us != begun_us
             if clock.ticks_diff(now_us, begun_us) + need_us > _PORTION_US and now_us != begun_us:
                 return True
