@@ -89,7 +89,7 @@ class Budget:
     """What is left of a period when the frame has been computed, and what is paid for out of that, in microseconds.
 
     `left` is the former; `sketch` is the cost of a sketch, `block` of a block of frames to come and `frame` of each frame in it;
-    `longest` is how many frames a block has at most.
+    `longest` is how many frames a block has at most. `stretch_percent` is how long a step lasts with the motor ticks in it.
     """
 
     def __init__(self, knots):
@@ -97,6 +97,7 @@ class Budget:
         self._knots = knots
         self.left_us = self.sketch_us = self.block_us = self.frame_us = 1
         self.longest = BLOCK
+        self.stretch_percent = 100
 
     def weigh(self, tables, playing, found):
         """Take over the load of the actions of a list."""
@@ -117,7 +118,9 @@ class Budget:
         self.block_us = block_us
         self.frame_us = frame_us
         tick_us = _TICK_US + _TICK_DOF_US * t.dofs
-        percent = max(20, 100 - _LINK_PERCENT - 100 * tick_us // t.motor_period_us)
+        tick_percent = 100 * tick_us // t.motor_period_us
+        self.stretch_percent = 10000 // max(20, 100 - tick_percent)
+        percent = max(20, 100 - _LINK_PERCENT - tick_percent)
         fixed_us = _FIXED_US + _FIXED_DOF_US * t.dofs + _FIXED_ACTION_US * found + _FIXED_MAPPING_US * mappings
         self.left_us = 10000 * percent // t.frame_rate_hz - fixed_us
 

@@ -225,17 +225,20 @@ class Future:
         return self.pending
 
     def need_us(self):
-        """Return about how long the next step of `work` takes."""
+        """Return about how long the next step of `work` takes, with the motor ticks that come in between."""
         stage = self._stage
+        us = 0
         if stage == _SKETCH or (stage == _BEGIN and self._has_news and self._is_sketchy):
-            return self._budget.sketch_us
-        if stage == _NEAR:
-            return budget.NEAR_US * self._changes
-        if stage == _COMPUTE:
+            us = self._budget.sketch_us
+        elif stage == _NEAR:
+            us = budget.NEAR_US * self._changes
+        elif stage == _COMPUTE:
             frames = self._wanted()
-            if frames:
-                return self._budget.block_us + frames * self._budget.frame_us if frames > 0 else budget.BEND_US * _BEND_DOFS
-        return 0
+            if frames > 0:
+                us = self._budget.block_us + frames * self._budget.frame_us
+            elif frames:
+                us = budget.BEND_US * _BEND_DOFS
+        return us * self._budget.stretch_percent // 100
 
     def expect_news(self):
         """Note that the next frame will have news, behind all work; return whether there is more of that now."""

@@ -219,9 +219,9 @@ class Puppet:
                 return True
             if not future.work(self.tables, self):
                 return True
-            if self.look():
-                return True
             now_us = self._board.ticks_us()
+            if self.clock.until_us(now_us) <= 0 or self.look():
+                return True
 
     def _has_time(self, need_us):
         """Return whether so much time is left until the next frame, or as much as there is behind any.
