@@ -152,8 +152,8 @@ class Puppet:
     def prepare(self):
         """Take a step of what is to be done between frames; return whether there was one to take.
 
-        That is the future that signal processing wants to know, and then an exchange of tables, for which blocks of that
-        future are left out. The last steps collect what tables leave on the heap, so that it does not fill up in the middle of a
+        That is the future that signal processing wants to know, and then an exchange of tables; if that finds no time in a
+        period, blocks of that future are left out. The last steps collect what tables leave on the heap, so that it does not fill up in the middle of a
         frame, note what is to be expected, and put the new tables into force. They wait until there is time for that.
         """
         if self.future.pending or self._has_heard():
@@ -208,7 +208,7 @@ class Puppet:
     def _work(self):
         """Work for a while; return whether there was time for that: a step that would make the next frame late is left to it."""
         future = self.future
-        if self.exchange.step >= 0:
+        if 0 <= self._waiting_since < self.frame:
             future.relent()
         begun_us = now_us = self._board.ticks_us()
         while True:
