@@ -171,7 +171,7 @@ class Puppet:
         if self._exchange_due:
             if self._exchange_due_in == self.frame:
                 self._exchange_due = False
-                self._waiting_since = -1
+                self._exchange_due_in = self._waiting_since = -1
                 self.exchange.carry_over()
                 self._tempos_changed = 1
             elif self._has_time(_CARRY_US):

@@ -48,7 +48,7 @@ def exp_q15(numerator, denominator):
 def _next_knots(
     knot: ptr32,
     glide: ptr32,
-    changed: ptr8,
+    changed: ptr16,
     dofs: int,
     target_q15: ptr16,
     at: int,
@@ -142,7 +142,7 @@ def _evaluate(knot: ptr32, reference_q24: ptr32, dofs: int, x_q15: int):
 
 
 @micropython.viper
-def _stand(knot: ptr32, glide: ptr32, changed: ptr8, dofs: int, position_q24: ptr32):
+def _stand(knot: ptr32, glide: ptr32, changed: ptr16, dofs: int, position_q24: ptr32):
     """Let all knots be where each DOF is: it stands there until the next knot."""
     d = 0
     while d < dofs:
@@ -213,7 +213,7 @@ class Trajectory:
         self.ring = Ring()
         self._knot = words(KNOTS * DOFS_MAX)
         self._glide = words(2 * DOFS_MAX)
-        self._changed = bytearray(DOFS_MAX)
+        self._changed = halves(DOFS_MAX)
         self._effect = 0  # the last frame that has taken effect
         self._part = 0  # of the frame under way, in millionths
         self._step = 0  # millionths of a frame in a tick
@@ -271,6 +271,7 @@ class Trajectory:
             gather_words(self._knot, keep, scratch, dofs, ZERO_Q24, place)
         for place in range(0, 2 * _DOFS, _DOFS):
             gather_words(self._glide, keep, scratch, dofs, ZERO_Q24, place)
+        gather_halves(self._changed, keep, scratch, dofs, 0, 0)
         self.ring.rearrange(gather_halves, keep, scratch, dofs, self.newest, rest_q15)
 
     def advance(self, dofs, playing, rest_q15):
