@@ -18,12 +18,13 @@ _KINDS = (PinsDriver, Pca9685Driver, BridgeDriver)  # in the order of their code
 
 
 class Drivers:
-    """All drivers of a board, and which of them serves which DOF."""
+    """All drivers of a board, and which of them serves which DOF. `flushes` tells that there are outputs that `flush` writes."""
 
     def __init__(self, board):
         self._board = board
         self._drivers = [kind(board) for kind in _KINDS]
         self._writing = self._next_writing = ()  # those that write in the tick and have outputs
+        self.flushes = self._next_flushes = False
         self._later = [driver for driver in self._drivers if not driver.in_tick]
         self._driver = bytearray([NO_DRIVER] * DOFS_MAX)
 
@@ -123,6 +124,7 @@ class Drivers:
         """Allocate what `load` needs for these tables."""
         used = set(tables.driver[dof] for dof in range(tables.dofs))
         self._next_writing = tuple(driver for code, driver in enumerate(self._drivers) if driver.in_tick and code in used)
+        self._next_flushes = any(driver in self._later for code, driver in enumerate(self._drivers) if code in used)
         for driver in self._drivers:
             driver.prepare(tables)
 
@@ -137,6 +139,7 @@ class Drivers:
         for dof in range(DOFS_MAX):
             self._driver[dof] = tables.driver[dof] if dof < tables.dofs else NO_DRIVER
         self._writing = self._next_writing
+        self.flushes = self._next_flushes
         return kept
 
     def attach(self, dof, until_us):

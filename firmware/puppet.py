@@ -33,7 +33,7 @@ from shared.formats import (
 )
 
 _COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
-_PORTION_US = const(4000)  # of work, behind which the main loop has its turn
+_PORTION_US = const(4000)  # of work, behind which drivers that do not write in the tick have their turn
 _OVERRUN_US = const(1500)  # by which a step may hold a frame up
 _CARRY_US = const(12000)  # what putting other tables into force takes
 _MARGIN_US = const(3000)  # between the end of a frame and what is done then
@@ -208,6 +208,7 @@ class Puppet:
     def _work(self):
         """Work for a while; return whether there was time for that: a step that would make the next frame late is left to it."""
         future = self.future
+        flushes = self.drivers.flushes
         if 0 <= self._waiting_since < self.frame:
             future.relent()
         begun_us = now_us = self._board.ticks_us()
@@ -215,7 +216,7 @@ class Puppet:
             need_us = future.need_us()
             if self.clock.until_us(now_us) < need_us - _OVERRUN_US:
                 return now_us != begun_us
-            if clock.ticks_diff(now_us, begun_us) + need_us > _PORTION_US and now_us != begun_us:
+            if flushes and now_us != begun_us and clock.ticks_diff(now_us, begun_us) + need_us > _PORTION_US:
                 return True
             if not future.work(self.tables, self):
                 return True
