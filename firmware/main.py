@@ -47,10 +47,13 @@ def _pass(board, puppet, link):
         return None
     if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0:
         puppet.step()
-        link.inbox.look()
+        waiting = link.inbox.look()
         link.report()
+        longest_us = 0 if waiting else 1  # what has come meanwhile has its turn before other work
+    else:
+        longest_us = 1 if waiting else _IDLE_US
     puppet.motor.attend()
-    longest_us = min(1 if waiting else _IDLE_US, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
+    longest_us = min(longest_us, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
     if puppet.frame >= 0:
         longest_us = min(longest_us, puppet.clock.until_us(board.ticks_us()))
     return longest_us
