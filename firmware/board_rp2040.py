@@ -291,20 +291,21 @@ class Board:
 
     def __init__(self):
         micropython.kbd_intr(-1)
-        self._stdin = sys.stdin.buffer
+        self._usb_read = sys.stdin.buffer.readinto  # bound once: binding allocates
         self._stdout = sys.stdout.buffer
         rx = machine.Pin(1, pull=machine.Pin.PULL_UP)
         self._uart = machine.UART(0, _UART_BAUD, tx=machine.Pin(0), rx=rx, rxbuf=1024, txbuf=1024)
         self._to_uart = False
         self._line_us = 0  # when the UART will have sent all that it has been given
         self._usb_bytes = _USB_BYTES  # at most so many of the buffer's have not been sent
-        self._usb_poll = select.poll()
-        self._usb_poll.register(sys.stdin, select.POLLIN)
+        usb_poll = select.poll()
+        usb_poll.register(sys.stdin, select.POLLIN)
+        self._usb_ready = usb_poll.ipoll
         self._usb_room = select.poll()
         self._usb_room.register(sys.stdout, select.POLLOUT)
         self._poll = select.poll()
         self._poll.register(sys.stdin, select.POLLIN)
-        for poll in (self._usb_poll, self._usb_room, self._poll):  # the first event allocates what tells of all
+        for poll in (usb_poll, self._usb_room, self._poll):  # the first event allocates what tells of all
             poll.register(self._uart, select.POLLOUT)
             for _ in poll.ipoll(0):
                 pass
@@ -411,17 +412,19 @@ class Board:
         """
         count = 0
         room = len(buffer)
-        byte = self._byte
+        single = self._byte
+        ready = self._usb_ready
+        read = self._usb_read
         while count < room:
-            ready = False
-            for _ in self._usb_poll.ipoll(0):
-                ready = True
-            if not ready:
+            byte = -1
+            for _ in ready(0):
+                read(single)
+                byte = single[0]
+            if byte < 0:
                 break
-            self._stdin.readinto(byte)
-            buffer[count] = byte[0]
+            buffer[count] = byte
             count += 1
-            if byte[0] == _CTRL_C and (count == 1 or buffer[count - 2] == _RETURN):
+            if byte == _CTRL_C and (count == 1 or buffer[count - 2] == _RETURN):
                 break
         if count:
             self._to_uart = False

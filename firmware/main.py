@@ -15,7 +15,7 @@ from firmware.puppet import Puppet
 from shared.formats import KILLED_BY_HOST
 
 _IDLE_US = 20000
-_PACKETS = 4  # that are carried out in one pass, at most
+_PACKETS = 8  # that are carried out in one pass, at most
 _LATE_US = 1500  # by which a frame may wait for what has come
 _WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board
 

@@ -115,6 +115,7 @@ class Puppet:
                 pass
             self.exchange.replace()
             self._rest()
+            gc.collect()  # what fills the heap slows down all that allocates
 
     def start(self):
         """Begin the motion anew: frame 0 is due at a motor tick soon. Targets that wait keep their stamps.
