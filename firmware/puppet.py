@@ -35,6 +35,7 @@ from shared.formats import (
 _COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
 _PORTION_US = const(4000)  # of work, behind which drivers that do not write in the tick have their turn
 _OVERRUN_US = const(1500)  # by which a step may hold a frame up
+_STEPS_US = const(2000)  # of preparations for an exchange
 _CARRY_US = const(12000)  # what putting other tables into force takes
 _MARGIN_US = const(3000)  # between the end of a frame and what is done then
 _LESS_US = const(500)  # that will do when it has been waited a frame longer
@@ -180,7 +181,7 @@ class Puppet:
                 self._exchange_due_in = self.frame
             else:
                 return False
-        elif self.exchange.prepare():
+        elif self._prepare_exchange():
             if self._waiting_since < 0:
                 self._waiting_since = self.frame
             if not self._has_time(_COLLECT_US):
@@ -189,6 +190,17 @@ class Puppet:
             self._exchange_due = True
             self._waiting_since = self.frame
         return True
+
+    def _prepare_exchange(self):
+        """Take some steps; return whether all is prepared."""
+        begun_us = now_us = self._board.ticks_us()
+        while clock.ticks_diff(now_us, begun_us) < _STEPS_US and self.clock.until_us(now_us) > 0:
+            if self.exchange.prepare():
+                return True
+            if self.look():
+                break
+            now_us = self._board.ticks_us()
+        return False
 
     def _expect(self):
         """Note what is to be expected from the next frame on, as it is without other tables."""

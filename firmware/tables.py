@@ -658,12 +658,20 @@ class Tables:
 
     def keep(self, kind, first, place, old):
         """Note that what is new at `first + place` was `old` in the tables that play, or NEW; it is field 2 and up."""
-        keep = (self.keep_action, self.keep_dof, self.keep_live)
-        if kind >= len(keep):
+        if kind == 0:
+            keep = self.keep_action
+            count = self.actions
+        elif kind == 1:
+            keep = self.keep_dof
+            count = self.dofs
+        elif kind == 2:
+            keep = self.keep_live
+            count = self.lives
+        else:
             return 0
-        if first + place >= (self.actions, self.dofs, self.lives)[kind]:
+        if first + place >= count:
             return 1
-        keep[kind][first + place] = old
+        keep[first + place] = old
         return None
 
     def live(self, live, rest_q28, rise_q26, fall_q26, predict, process_q16, noise_q16, fade_q15):
