@@ -347,7 +347,8 @@ class Pca9685Driver(Driver):
     def prepare(self, tables):
         """Note what is to be sent to each chip."""
         for device in range(DEVICES_MAX):
-            self._chips[device].prepare(tables, device)
+            if tables.device_driver[device] == DRIVER_PCA9685:
+                self._chips[device].prepare(tables, device)
 
     def load(self, tables):
         """Keep the pulses of channels that stay, on chips that stay as they are."""

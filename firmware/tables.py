@@ -103,6 +103,24 @@ def _fill_bytes(values: ptr8, count: int, value: int):
         i += 1
 
 
+@micropython.viper
+def _link(first: int, count: int, function: ptr8, argument: ptr16, blink: int, same: ptr16):
+    """Write to `same` for each of `count` mappings the first with the same function and argument; blinks have none but themselves."""
+    mapping = first
+    end = first + count
+    while mapping < end:
+        found = mapping
+        kind = int(function[mapping])
+        if kind < blink:
+            other = first
+            while other < found:
+                if int(function[other]) == kind and int(argument[other]) == int(argument[mapping]):
+                    found = other
+                other += 1
+        same[mapping] = found
+        mapping += 1
+
+
 def words(count):
     """Return an array of `count` signed 32-bit words, all 0.
 
@@ -647,14 +665,7 @@ class Tables:
 
     def link_repeats(self, action):
         """Note for an action's mappings which one before has the same function: that is evaluated once."""
-        first = self.first_mapping[action]
-        for mapping in range(first, first + self.mapping_count[action]):
-            self.same[mapping] = mapping
-            function = self.function[mapping]
-            for other in range(first, mapping if function < FUNCTION_BLINK else first):
-                if self.function[other] == function and self.argument[other] == self.argument[mapping]:
-                    self.same[mapping] = other
-                    break
+        _link(self.first_mapping[action], self.mapping_count[action], self.function, self.argument, FUNCTION_BLINK, self.same)
 
     def keep(self, kind, first, place, old):
         """Note that what is new at `first + place` was `old` in the tables that play, or NEW; it is field 2 and up."""
