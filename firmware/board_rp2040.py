@@ -26,8 +26,6 @@ from firmware.clock import ticks_diff
 _UART_BAUD = const(115200)
 _PINS = const(30)
 _LAST_PIN = const(28)
-_RETURN = const(13)
-_CTRL_C = const(3)
 
 # What a pin does, by pin.
 _OFF = const(0)
@@ -206,6 +204,32 @@ def _alarm_us() -> int:
     """Return the instant of the timer's alarm 3, MicroPython's, modulo 2^30."""
     base = _TIMER
     return int(ptr32(base << 2)[7]) & 0x3FFFFFFF
+
+
+@micropython.viper
+def _read(ready, read, single, buffer: ptr8, room: int) -> int:
+    """Read what has come over USB, up to `0D 03`; return the number of bytes.
+
+    One at a time: `read` waits for as many as are asked for, and `ready(0)` only tells whether there is one.
+    """
+    byte = ptr8(single)
+    count = 0
+    before = 13
+    while count < room:
+        is_ready = 0
+        for _ in ready(0):
+            is_ready = 1
+        if is_ready == 0:
+            return count
+        read(single)
+        now = int(byte[0])
+        buffer[count] = now
+        count += 1
+        if now == 3:
+            if before == 13:
+                return count
+        before = now
+    return count
 
 
 @micropython.viper
@@ -410,22 +434,8 @@ class Board:
 
         Over USB `0D 03` ends a read: if it calls for the REPL, what follows is meant for that.
         """
-        count = 0
         room = len(buffer)
-        single = self._byte
-        ready = self._usb_ready
-        read = self._usb_read
-        while count < room:
-            byte = -1
-            for _ in ready(0):
-                read(single)
-                byte = single[0]
-            if byte < 0:
-                break
-            buffer[count] = byte
-            count += 1
-            if byte == _CTRL_C and (count == 1 or buffer[count - 2] == _RETURN):
-                break
+        count = _read(self._usb_ready, self._usb_read, self._byte, buffer, room)
         if count:
             self._to_uart = False
         else:
