@@ -49,11 +49,10 @@ def _pass(board, puppet, link):
         puppet.step()
         waiting = link.inbox.look()
         link.report()
-        longest_us = 0 if waiting else 1  # what has come meanwhile has its turn before other work
-    else:
-        longest_us = 1 if waiting else _IDLE_US
     puppet.motor.attend()
-    longest_us = min(longest_us, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
+    if waiting:  # that has its turn before the work between frames
+        return 0
+    longest_us = min(_IDLE_US, ticks_diff(board.tick_due_us(), board.ticks_us()) + 1)
     if puppet.frame >= 0:
         longest_us = min(longest_us, puppet.clock.until_us(board.ticks_us()))
     return longest_us

@@ -35,6 +35,7 @@ from shared.formats import (
 _COLLECT_US = const(15000)  # what the heap's collection takes on an RP2040
 _PORTION_US = const(4000)  # of work, behind which drivers that do not write in the tick have their turn
 _OVERRUN_US = const(1500)  # by which a step may hold a frame up
+_PATIENCE = const(3)  # frames that an exchange may take before other work is left out
 _STEPS_US = const(2000)  # of preparations for an exchange
 _CARRY_US = const(12000)  # what putting other tables into force takes
 _MARGIN_US = const(3000)  # between the end of a frame and what is done then
@@ -102,6 +103,7 @@ class Puppet:
         self.exchange = Exchange(self)
         self._exchange_due = False
         self._exchange_due_in = -1  # the frame before which it is, once that has been prepared for
+        self._committed = -1  # the frame in which tables have been committed last
         self._waiting_since = -1  # the frame since which time is wanted for an exchange
         self._tempos_changed = 0
         self._is_starting = False
@@ -111,6 +113,7 @@ class Puppet:
     def commit(self):
         """Let the staged tables, which are complete, replace those that play: now, or when the motion runs, soon."""
         self.exchange.begin()
+        self._committed = self.frame
         if self.frame < 0:
             while not self.exchange.prepare():
                 pass
@@ -154,8 +157,8 @@ class Puppet:
     def prepare(self):
         """Take a step of what is to be done between frames; return whether there was one to take.
 
-        That is the future that signal processing wants to know, and then an exchange of tables; if that finds no time in a
-        period, blocks of that future are left out. The last steps collect what tables leave on the heap, so that it does not fill up in the middle of a
+        That is the future that signal processing wants to know, and then an exchange of tables; if that finds no time for
+        some frames, blocks of that future are left out. The last steps collect what tables leave on the heap, so that it does not fill up in the middle of a
         frame, note what is to be expected, and put the new tables into force. They wait until there is time for that.
         """
         if self.future.pending or self._has_heard():
@@ -222,7 +225,7 @@ class Puppet:
         """Work for a while; return whether there was time for that: a step that would make the next frame late is left to it."""
         future = self.future
         flushes = self.drivers.flushes
-        if 0 <= self._waiting_since < self.frame:
+        if self.exchange.step >= 0 and self.frame >= self._committed + _PATIENCE:
             future.relent()
         begun_us = now_us = self._board.ticks_us()
         while True:
