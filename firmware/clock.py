@@ -33,8 +33,8 @@ def ticks_diff(later, earlier):
 class FrameClock:
     """Tells when frames are due; measures how late they were begun.
 
-    `rate_hz` is the frame rate, 10..60. `late_us` is how late the last frame was begun, `late_max_us` how late one was at most since
-    `start`.
+    `rate_hz` is the frame rate, 10..60. `late_us` is how late the last frame was begun, `late_max_us` how late one was at most
+    since `start`.
     """
 
     def __init__(self):

@@ -39,7 +39,10 @@ class Driver:
         """Allocate what `load` needs."""
 
     def load(self, tables):
-        """Serve other tables, allocating nothing. Outputs that are gone fall silent; return the DOFs whose output goes on as it was, as bits."""
+        """Serve the prepared tables; allocates nothing.
+
+        Outputs that are gone fall silent; return the DOFs whose output goes on as it was, as bits.
+        """
         return 0
 
     def attach(self, dof, until_us):

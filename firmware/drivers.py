@@ -23,7 +23,7 @@ class Drivers:
     def __init__(self, board):
         self._board = board
         self._drivers = [kind(board) for kind in _KINDS]
-        self._writing = self._next_writing = ()  # those that write in the tick and have outputs
+        self._writing = self._next_writing = tuple(self._drivers)  # those that write in the tick and have outputs
         self.flushes = self._next_flushes = False
         self._later = [driver for driver in self._drivers if not driver.in_tick]
         self._driver = bytearray([NO_DRIVER] * DOFS_MAX)
@@ -122,7 +122,7 @@ class Drivers:
 
     def prepare(self, tables):
         """Allocate what `load` needs for these tables."""
-        used = set(tables.driver[dof] for dof in range(tables.dofs))
+        used = {tables.driver[dof] for dof in range(tables.dofs)}
         self._next_writing = tuple(driver for code, driver in enumerate(self._drivers) if driver.in_tick and code in used)
         self._next_flushes = any(driver in self._later for code, driver in enumerate(self._drivers) if code in used)
         for driver in self._drivers:

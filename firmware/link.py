@@ -35,7 +35,8 @@ _WELCOME_END = _PAYLOAD + messages.size(_WELCOME_FIELDS)
 class Link:
     """Receives and answers for one puppet.
 
-    `packets` and `damaged` count what came. `inbox`, `commands`, `telemetry` and `store` are its parts. A packet to send is put into `out`, two bytes of head first, and sent by `send`.
+    `packets` and `damaged` count what came. `inbox`, `commands`, `telemetry` and `store` are its parts. A packet to send is put
+    into `out`, two bytes of head first, and sent by `send`.
     """
 
     def __init__(self, board, puppet):
@@ -84,7 +85,7 @@ class Link:
         self._board.send(self._out_wire, codec.encode(out, length, self._out_wire), is_telemetry)
 
     def _kill(self, seq):
-        """Carry a kill out now, whatever is missing before it, or has come but not had its turn; in its turn that is done again."""
+        """Carry a kill out now, whatever is missing before it, or waits before it; in its turn that is done again."""
         self._puppet.motor.kill(KILLED_BY_HOST)
         self._kills = 0 < (seq - self._expected) & 255 < 128
 

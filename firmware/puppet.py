@@ -53,7 +53,8 @@ class Puppet:
     `frame` is the number of the next frame, -1 while the motion does not run. `base_q15` and `signal_q15` hold the last
     frame's values per DOF, after the compositor and after signal processing; `motor.motor_q15` what the motors were
     told. `entered` is how many actions have entered in the last frame. `clipped` counts the values that signal processing has
-    clipped at the ends of their range since `start`. `look` is what whatever takes long calls now and then, for a kill may come; it returns how much waits.
+    clipped at the ends of their range since `start`. `look` is what whatever takes long calls now and then, for a kill may come;
+    it returns how much waits.
     """
 
     def __init__(self, board):
@@ -157,9 +158,10 @@ class Puppet:
     def prepare(self):
         """Take a step of what is to be done between frames; return whether there was one to take.
 
-        That is the future that signal processing wants to know, and then an exchange of tables; if that finds no time for
-        some frames, blocks of that future are left out. The last steps collect what tables leave on the heap, so that it does not fill up in the middle of a
-        frame, note what is to be expected, and put the new tables into force. They wait until there is time for that.
+        That is the future that signal processing wants to know, and then an exchange of tables; if that finds no time for some
+        frames, blocks of that future are left out. The last steps collect what tables leave on the heap, so that it does not fill
+        up in the middle of a frame, note what is to be expected, and put the new tables into force. They wait until there is time
+        for that.
         """
         if self.future.pending or self._has_heard():
             micropython.heap_lock()  # as in a frame

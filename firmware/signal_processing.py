@@ -125,7 +125,7 @@ def _step(
     step_q20: ptr32,
     offset_q20: ptr32,
 ):
-    """Let `step` be what `corr` has lost by the news; add what is `left` of that by now to every `e`, and what it `lost` to `v / F`.
+    """Let `step` be what `corr` has lost by the news; add what is `left` of it by now to every `e`, what it `lost` to `v / F`.
 
     What `step` was before has been added already. `e` stays within 16. Bits: `corr` is within 16, 2^24; limbs of 14 + 12 bits
     times 15.

@@ -105,7 +105,7 @@ def _fill_bytes(values: ptr8, count: int, value: int):
 
 @micropython.viper
 def _link(first: int, count: int, function: ptr8, argument: ptr16, blink: int, same: ptr16):
-    """Write to `same` for each of `count` mappings the first with the same function and argument; blinks have none but themselves."""
+    """Write to `same` for each of `count` mappings the first with its function and argument; blinks have only themselves."""
     mapping = first
     end = first + count
     while mapping < end:

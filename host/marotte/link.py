@@ -192,7 +192,8 @@ def wire_packet(message_id: int, seq: int, payload: bytes) -> bytes:
 def _is_harmless(greeting: bytes) -> bool:
     """Return whether a greeting neither interrupts MicroPython's start, nor restarts it from its REPL.
 
-    The first byte of most is Ctrl-D, as the fourth of their bodies is a zero: each has to leave text on the REPL's line for the next.
+    The first byte of most is Ctrl-D, as the fourth of their bodies is a zero: each has to leave text on the REPL's line for the
+    next.
     """
     rest = greeting[1:]
     text = rest[max(map(rest.rfind, _ERASERS)) + 1 :]

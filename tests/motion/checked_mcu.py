@@ -41,11 +41,15 @@ SMALL_INT_FUNCTIONS = (
         "exchange", "_sketch", "_recall", "_begin", "_differ", "_bend_near", "_bend_far", "_bend", "_compute_some", "_wanted",
         "_compute",
     ),
+    *methods("Inbox", "look", "next", "is_calling", "_put"),
     *methods("Exchange", "carry_over", "_carry_synthesis", "_swap"),
-    *methods("Puppet", "start", "stop", "prepare", "step", "expects_news", "_synthesise", "_rest", "_work", "_has_heard", "_expect"),
+    *methods(
+        "Puppet", "start", "stop", "prepare", "step", "expects_news", "_synthesise", "_rest", "_work", "_has_heard", "_expect",
+        "_has_time",
+    ),
     *methods(
         "Motor", "exchange", "start", "stand", "put", "heard", "arm", "kill", "limit", "attach", "detach", "derive",
-        "attend", "_rearrange", "_gather", "_tick", "_steps", "_tap", "_stand", "_hold_unattached",
+        "attend", "_rearrange", "_take_over", "_tick", "_steps", "_tap", "_stand", "_hold_unattached",
     ),
     *methods("Ring", "put", "rearrange"),
     *methods(
@@ -56,18 +60,18 @@ SMALL_INT_FUNCTIONS = (
     *methods(
         "Guards", "arm", "disarm", "attend", "_outputs", "_kept", "_queue", "_attach_next", "_attach", "_detach"
     ),
-    *methods("Drivers", "attach", "release", "write", "flush", "quiet", "attend"),
-    *methods("PinsDriver", "attach", "release", "write", "quiet"),
-    *methods("BridgeDriver", "attach", "release", "write", "_write", "quiet"),
-    *methods("Pca9685Driver", "attach", "release", "flush", "attend", "quiet", "_enable", "_switch", "_wanted"),
-    *methods("_Chip", "attach", "release", "quiet", "flush", "attend", "_set_up", "gone", "_transfer"),
+    *methods("Drivers", "load", "attach", "release", "write", "flush", "quiet", "attend"),
+    *methods("PinsDriver", "load", "attach", "release", "write", "quiet"),
+    *methods("BridgeDriver", "load", "attach", "release", "write", "_write", "quiet"),
+    *methods("Pca9685Driver", "load", "attach", "release", "flush", "attend", "quiet", "_enable", "_switch", "_wanted"),
+    *methods("_Chip", "load", "_take_channels", "attach", "release", "quiet", "flush", "attend", "_set_up", "gone", "_transfer"),
     *methods("Link", "poll", "report", "send", "_packet", "_answer", "_drop"),
     *methods("Commands", "carry_out", "_queue", "_refuse"),
     *methods(
         "Commands", "_on_weight_targets", "_on_live_targets", "_on_tempo", "_on_telemetry", "_on_start", "_on_stop", "_on_ping",
         "_on_arm", "_on_kill", "_on_hello", "_on_calibrate", "_on_limit",
     ),
-    "_half", "_word", *methods("Tables", "bad_limit", "_bad_limit", "limit", "bad_calibration", "_bad_calibration", "calibrate"),
+    "_half", "_word", "_scale_q21", "_fold", *methods("Tables", "bad_limit", "_bad_limit", "limit", "bad_calibration", "_bad_calibration", "calibrate"),
     *methods("Telemetry", "report", "_report_taps", "_send_taps", "_pack_frame"),
 )
 """What runs while a puppet plays: a larger integer would allocate on a 32-bit port."""
