@@ -97,6 +97,18 @@ def test_kill_behind_all_that_fits_acts_before_any_of_it_is_taken():
     assert killed == [9] and next(packets(inbox)) == before[:-1]
 
 
+def test_kill_of_which_one_bit_is_wrong_does_nothing():
+    for place in range(KILL_LENGTH):
+        for bit in range(8):
+            board = Board()
+            inbox, killed = inbox_of(board)
+            wire = bytearray(kill(9))
+            wire[place] ^= 1 << bit
+            board.bytes += wire
+            inbox.look()
+            assert killed == []
+
+
 def test_what_finds_no_room_waits_on_the_board():
     board = Board()
     inbox, _ = inbox_of(board)
