@@ -71,7 +71,8 @@ SMALL_INT_FUNCTIONS = (
         "Commands", "_on_weight_targets", "_on_live_targets", "_on_tempo", "_on_telemetry", "_on_start", "_on_stop", "_on_ping",
         "_on_arm", "_on_kill", "_on_hello", "_on_calibrate", "_on_limit",
     ),
-    "_half", "_word", "_scale_q21", "_fold", *methods("Tables", "bad_limit", "_bad_limit", "limit", "bad_calibration", "_bad_calibration", "calibrate"),
+    "_half", "_word", "_scale_q21", "_fold",
+    *methods("Tables", "bad_limit", "_bad_limit", "limit", "bad_calibration", "_bad_calibration", "calibrate"),
     *methods("Telemetry", "report", "_report_taps", "_send_taps", "_pack_frame"),
 )
 """What runs while a puppet plays: a larger integer would allocate on a 32-bit port."""
