@@ -23,7 +23,7 @@ _WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset t
 def _take(board, puppet, link):
     """Carry out what has come, until a frame is due; return how many bytes wait, -1 if the REPL is called for.
 
-    If a frame is late already, it comes first; only a kill does not wait for it.
+    If a frame is late already, it comes first, and only a kill does not wait for it.
     """
     if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) < -_LATE_US:
         return link.inbox.look()
@@ -47,7 +47,9 @@ def _pass(board, puppet, link):
         return None
     if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0:
         puppet.step()
-        waiting = link.inbox.look()
+        waiting = link.poll()  # one packet at least has its turn, even if every frame is late
+        if waiting < 0:
+            return None
         link.report()
     puppet.motor.attend()
     if waiting:  # that has its turn before the work between frames
