@@ -103,7 +103,6 @@ for layer in layers:
 """
 
 MEASURE_TELEMETRY = """
-from firmware.link import Link
 link = Link(board, puppet)
 puppet.motor.heard()
 link.telemetry.ask(7, 1, 1)

@@ -103,7 +103,7 @@ print(list(portion_us))
 PARTS = {
     "a sketch: news takes two": "future._sketch(t, puppet, True)",
     "a block of 16 frames to come": "future._foresight.evaluate(t, future._outlook, 16, 0, puppet)",
-    "the bands of a frame": "future._levels(t, future._frame)",
+    "the bands of a frame": "future._rings.split(t, future._frame)",
     "the signal from the bands": "puppet.processing.process(t, puppet.base_q15, future.level_q16, puppet.signal_q15)",
 }
 """Parts of it, each a call that may be repeated."""

@@ -48,6 +48,7 @@ SETUP = f"""
 room.clear()
 import array, gc, micropython, time
 gc.collect()
+from firmware.link import Link  # first, while the heap has room for the text of its dictionary
 from firmware import actions, clock, compositor, functions, weights
 from firmware.board_rp2040 import Board
 from firmware.cues import GAIN, WEIGHT

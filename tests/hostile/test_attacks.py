@@ -216,9 +216,9 @@ def mapping(self, mapping, dof, *rest):
 Tables.mapping = mapping
 """,
     "a packet that is too long": """
-from firmware import link
-original = link._collect
-link._collect = lambda chunk, start, end, wire, length, room: original(chunk, start, end, wire, length, 2 * room)
+from firmware import inbox
+original = inbox._next
+inbox._next = lambda ring, wire, room, state: original(ring, wire, 2 * room, state)
 """,
 }
 

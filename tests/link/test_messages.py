@@ -36,7 +36,7 @@ COUNTS = {
     *("bytes", "crc32", "place", "byte"),
     *("dofs_max", "actions_max", "mappings_max", "lives_max", "queue_max", "late_frames", "late_targets", "heap_free"),
     "refused_targets",
-    *("signal", "predict", "band", "clipped"),
+    *("signal", "predict", "band", "clipped", "cut_short"),
 }
 """Counts, indices, flags and bit sets: what has no unit."""
 
