@@ -17,15 +17,17 @@ from shared.formats import KILLED_BY_HOST
 _IDLE_US = 20000
 _PACKETS = 8  # that are carried out in one pass, at most
 _LATE_US = 1500  # by which a frame may wait for what has come
+_OVERDUE_US = 20000  # by which frames are late where they take all the time
 _WATCHDOG_MS = 2000  # a main loop or ticks that stand still for so long reset the board
 
 
 def _take(board, puppet, link):
     """Carry out what has come, until a frame is due; return how many bytes wait, -1 if the REPL is called for.
 
-    If a frame is late already, it comes first, and only a kill does not wait for it.
+    If a frame is late already, it comes first, and only a kill does not wait for it; but where frames take all the time there is,
+    a packet has its turn before each of them.
     """
-    if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) < -_LATE_US:
+    if puppet.frame >= 0 and -_OVERDUE_US < puppet.clock.until_us(board.ticks_us()) < -_LATE_US:
         return link.inbox.look()
     for _ in range(_PACKETS):
         waiting = link.poll()
@@ -47,9 +49,7 @@ def _pass(board, puppet, link):
         return None
     if puppet.frame >= 0 and puppet.clock.until_us(board.ticks_us()) <= 0:
         puppet.step()
-        waiting = link.poll()  # one packet at least has its turn, even if every frame is late
-        if waiting < 0:
-            return None
+        waiting = link.inbox.look()
         link.report()
     puppet.motor.attend()
     if waiting:  # that has its turn before the work between frames
