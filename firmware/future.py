@@ -141,7 +141,7 @@ class Future:
         if self._is_idle:
             return
         if not self.is_sketched:
-            if self._budget.sketch_us < _SKETCH_MOST_US - puppet.clock.late_us:
+            if self._budget.sketch_us * self._budget.stretch_percent // 100 < _SKETCH_MOST_US - puppet.clock.late_us:
                 self.sketch_before(tables, puppet)
             else:
                 self._is_sketchy = False
