@@ -28,6 +28,8 @@ FUNCTIONS = ("rsin", "noise1", "noise7", "rcos")
 EVERYTHING = ALL_TAPS | formats.TAP_DERIVATIVES
 SMOOTH_US = 10_000
 """By so much a frame may begin late under a full line."""
+LATE_FRAMES = 50
+"""One of so many may come too late for its tick at 333 Hz, where ticks take half of the time and come ten times as often."""
 
 LOADS = [
     ("usb", 6, 50, False),
@@ -141,7 +143,8 @@ def overload(mcu, active, rate, signal, for_us, kills):
         f"pin {max(took_us['pin']) / 1000:.1f} ms at most"
     )
     assert abs(frames - lasted_us * FRAME_RATE / 1e6) <= 2, "the frame clock keeps to its instants"
-    assert late == 0 and after["late_max_us"] <= SMOOTH_US
+    assert after["late_max_us"] <= SMOOTH_US
+    assert late <= (frames // LATE_FRAMES if rate == 333 else 0)
     assert after["damaged"] == before["damaged"]
     assert load.refused > 0
     assert load.session.status()["refused_targets"] == load.refused
